@@ -173,9 +173,10 @@ def _beside_vanes(y_m: np.ndarray, x_m: np.ndarray, width_m: float, spiders: Spi
     for angle_rad in np.deg2rad(spiders.angles_deg):
         along_m = x_m * np.cos(angle_rad) + y_m * np.sin(angle_rad)
         across_m = np.abs(y_m * np.cos(angle_rad) - x_m * np.sin(angle_rad))
-        right_m = np.minimum(across_m + width_m / 2, spiders.width_m / 2)
-        left_m = np.maximum(across_m - width_m / 2, -spiders.width_m / 2)
-        covered = np.clip((right_m - left_m) / width_m, 0, 1)  # overlap of vane and pixel, across the vane
+        seen_m = width_m * (abs(np.cos(angle_rad)) + abs(np.sin(angle_rad)))  # a square, seen along the vane
+        right_m = np.minimum(across_m + seen_m / 2, spiders.width_m / 2)
+        left_m = np.maximum(across_m - seen_m / 2, -spiders.width_m / 2)
+        covered = np.clip((right_m - left_m) / seen_m, 0, 1)  # overlap of vane and pixel, across the vane
         free = free * (1 - covered * _covered(-along_m, width_m))
     return free
 

@@ -5,7 +5,7 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.special import eval_jacobi
 
 from nlcwfs.beam.grid import Grid
@@ -94,16 +94,19 @@ class ZernikeFit(eqx.Module):
 
     Attributes:
         matrix: What every pixel adds to a coefficient; entry 0 is Noll 1.
+        lit: Pixels that are looked at.
         condition: Ratio of the best to the worst seen combination of Zernikes on this pupil (1 on a disc).
     """
 
-    matrix: Float[np.ndarray, "noll y x"]
+    matrix: Float[np.ndarray | Array, "noll y x"]
+    lit: Bool[np.ndarray | Array, "y x"]
     condition: float = eqx.field(static=True)
 
     def coefficients(self, opd_m: Float[Array | np.ndarray, "y x"]) -> Float[Array, " noll"]:
         """Least-squares coefficients, in metres; pixels outside the pupil are not looked at."""
-        opd_m = jnp.asarray(opd_m)
-        return jnp.tensordot(jnp.asarray(self.matrix, opd_m.dtype), opd_m, axes=2)
+        # `where` and not a product alone: NaN outside the pupil is how files mark it.
+        seen_m = jnp.where(jnp.asarray(self.lit), jnp.asarray(opd_m), 0)
+        return jnp.tensordot(jnp.asarray(self.matrix, seen_m.dtype), seen_m, axes=2)
 
 
 def zernike_fit(pupil: Float[np.ndarray, "y x"], grid: Grid, *, diameter_m: float, count: int) -> ZernikeFit:
@@ -137,7 +140,7 @@ def zernike_fit(pupil: Float[np.ndarray, "y x"], grid: Grid, *, diameter_m: floa
         raise SamplingError("zernikes.count", f"{rule}; ask for fewer", count)
     matrix = np.zeros((count, *pupil.shape))
     matrix[:, lit] = (left / singular) @ right * root
-    return ZernikeFit(matrix, float(condition))
+    return ZernikeFit(matrix, lit, float(condition))
 
 
 def _zernikes(nolls, grid: Grid, diameter_m: float) -> np.ndarray:
