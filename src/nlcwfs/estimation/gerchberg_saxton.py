@@ -1,0 +1,163 @@
+"""Gerchberg-Saxton over the defocused planes, the phase carried from one iteration to the next."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from nlcwfs.estimation.amplitude_constraint import modulus_factor
+from nlcwfs.estimation.resolution_level import Level, Measurement
+from nlcwfs.estimation.settings import GerchbergSaxtonSettings
+from nlcwfs.estimation.turbulence_filter import smooth_like_turbulence
+
+
+class GerchbergSaxtonState(eqx.Module):
+    """What an iteration hands to the next.
+
+    Attributes:
+        phase_rad: The phase on the model's grid, without the reference.
+        previous_rad: The phase one iteration earlier, for fast-forward.
+        change_rad: Rms over the pupil by which the last iteration moved the phase.
+        iteration: Number of iterations so far.
+    """
+
+    phase_rad: Float[Array, "y x"]
+    previous_rad: Float[Array, "y x"]
+    change_rad: Float[Array, ""]
+    iteration: Int[Array, ""]
+
+
+class Problem(NamedTuple):
+    """One measurement at one resolution.
+
+    Attributes:
+        level: The sensor.
+        measurement: The counts.
+        reference_rad: Phase that is added and never smoothed: starting tilt and static aberration.
+        power: The filter of the present cutoff.
+        strength: Variance of the turbulence over that behind `power`.
+    """
+
+    level: Level
+    measurement: Measurement
+    reference_rad: Float[Array, "y x"]
+    power: Float[Array, "y fx"]
+    strength: Float[Array, ""]
+
+
+def init(phase_rad: Float[Array, "y x"]) -> GerchbergSaxtonState:
+    """The state before the first iteration."""
+    far = jnp.asarray(jnp.inf, phase_rad.dtype)
+    return GerchbergSaxtonState(phase_rad, phase_rad, far, jnp.asarray(0, jnp.int32))
+
+
+def step(
+    problem: Problem, settings: GerchbergSaxtonSettings, state: GerchbergSaxtonState
+) -> GerchbergSaxtonState:
+    """One Gerchberg-Saxton iteration over all planes.
+
+    Fast-forward: the iteration starts ahead of the phase, along its last step. Then, for all planes at once
+    (`averaged`) or one after the other (`serial`): light to the plane, modulus towards the measured one, light
+    back; the pupil's modulus is put back by keeping the phase only.
+    """
+    planes = problem.measurement.counts.shape[0]
+    phase_rad = state.phase_rad + settings.fast_forward * (state.phase_rad - state.previous_rad)
+    if settings.scheme == "averaged":
+        phase_rad = _through_planes(problem, settings, phase_rad, jnp.arange(planes))
+    else:
+        phase_rad = jax.lax.fori_loop(
+            0, planes, lambda p, phase: _through_planes(problem, settings, phase, p[None]), phase_rad
+        )
+    light = problem.level.light
+    moved = phase_rad - state.phase_rad
+    moved = moved - jnp.sum(light * moved) / jnp.sum(light)
+    change_rad = jnp.sqrt(jnp.sum(light * moved**2) / jnp.sum(light))
+    return GerchbergSaxtonState(phase_rad, state.phase_rad, change_rad, state.iteration + 1)
+
+
+def terminate(problem: Problem, state: GerchbergSaxtonState) -> Array:
+    """Whether the level is done: its iterations are used up, the phase rests, or left the finite numbers."""
+    level = problem.level
+    rests = state.change_rad < level.tolerance_rad
+    lost = (state.iteration > 0) & ~jnp.isfinite(state.change_rad)
+    return (state.iteration >= level.iterations) | rests | lost
+
+
+def pupil_light(level: Level, phase_rad: Float[Array, "y x"]) -> Complex[Array, "y x"]:
+    """Light of unit power at the pupil with this phase."""
+    modulus = level.optics.pupil / jnp.sqrt(jnp.sum(level.optics.pupil**2))
+    return jax.lax.complex(modulus * jnp.cos(phase_rad), modulus * jnp.sin(phase_rad))
+
+
+def modelled_counts(
+    level: Level, measurement: Measurement, far: Complex[Array, "plane y x"], planes: Int[Array, " p"]
+) -> Float[Array, "p v u"]:
+    """The model's light on the measured pixels, in the photo-electrons of each plane."""
+    seen = level.on_pixels(far.real**2 + far.imag**2)
+    usable = measurement.usable[planes]
+    total = jnp.sum(jnp.where(usable, measurement.counts[planes], 0), axis=(1, 2))
+    share = jnp.sum(jnp.where(usable, seen, 0), axis=(1, 2))
+    return seen * (total / jnp.maximum(share, jnp.finfo(seen.dtype).tiny))[:, None, None]
+
+
+def _through_planes(
+    problem: Problem,
+    settings: GerchbergSaxtonSettings,
+    phase_rad: Float[Array, "y x"],
+    planes: Int[Array, " p"],
+) -> Float[Array, "y x"]:
+    """To some planes and back: the phase after the measured moduli have been imposed there."""
+    level, measurement = problem.level, problem.measurement
+    near = pupil_light(level, phase_rad + problem.reference_rad)
+    transfer = level.optics.transfer[0][planes]
+    far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * transfer)
+    factor = modulus_factor(
+        measurement.counts[planes],
+        modelled_counts(level, measurement, far, planes),
+        measurement.usable[planes],
+        method=settings.amplitude,
+        read_variance=measurement.read_variance,
+    )
+    share = level.optics.flux_fractions[planes]
+    spectra = jnp.fft.fft2(far * level.on_cells(factor).astype(far.dtype)) * jnp.conj(transfer)
+    spectrum = jnp.sum(spectra * (share / jnp.sum(share))[:, None, None].astype(far.dtype), axis=0)
+    if settings.filter == "low-pass":
+        spectrum = spectrum * level.low_pass.astype(far.dtype)
+    returned = jnp.fft.ifft2(spectrum)
+    turned_rad = jnp.angle(returned * jnp.conj(near)) * level.light
+    phase_rad = phase_rad + level.gain * turned_rad
+    if settings.filter != "turbulence":
+        return phase_rad
+    return smooth_like_turbulence(
+        phase_rad, problem.power * problem.strength, level.gain * phase_noise(level, measurement)
+    )
+
+
+def phase_noise(level: Level, measurement: Measurement) -> Float[Array, ""]:
+    """Variance of the phase that photon noise allows in a fully lit pixel: 1 / (4 photons), rad^2."""
+    total = jnp.sum(jnp.where(measurement.usable, measurement.counts, 0))
+    photons = jnp.maximum(total, 1) / jnp.sum(level.light)
+    return 1 / (4 * photons)
+
+
+def ffts_per_iteration(planes: int, settings: GerchbergSaxtonSettings) -> int:
+    """Two-dimensional FFTs of one iteration, those of the filter included.
+
+    Examples:
+        >>> ffts_per_iteration(4, GerchbergSaxtonSettings(filter="none"))
+        10
+    """
+    filtering = 2 if settings.filter == "turbulence" else 0
+    if settings.scheme == "averaged":
+        return 2 * planes + 2 + filtering
+    return planes * (4 + filtering)
+
+
+def low_pass_factor(
+    frequency_per_m: Float[np.ndarray, "y x"], *, cutoff_per_m: float
+) -> Float[np.ndarray, "y x"]:
+    """The paper's filtering inside the loop, as a smooth cut of the returning light."""
+    return np.exp(-((frequency_per_m / cutoff_per_m) ** 4))

@@ -1,0 +1,108 @@
+"""One resolution of the coarse-to-fine ladder: the sensor on a grid, and the counts on it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
+
+
+class Measurement(eqx.Module):
+    """The counts of one exposure, and which of them to use.
+
+    Attributes:
+        counts: Photo-electrons, background subtracted.
+        usable: False where masked, saturated, or beyond the detector's window.
+        read_variance: Variance of a pixel without light, electrons squared.
+    """
+
+    counts: Float[Array, "plane y x"]
+    usable: Bool[Array, "plane y x"]
+    read_variance: Float[Array, ""]
+
+    def padded(self, shape: tuple[int, int]) -> "Measurement":
+        """The same counts in a wider window, whose rim was not measured."""
+        margins = [(0, 0)] + [
+            ((outer - inner) // 2, (outer - inner) // 2)
+            for outer, inner in zip(shape, self.counts.shape[1:], strict=True)
+        ]
+        return Measurement(
+            jnp.pad(self.counts, margins), jnp.pad(self.usable, margins), self.read_variance
+        )
+
+    def binned(self, factor: int) -> "Measurement":
+        """Counts summed over squares of pixels; a masked pixel counts as the mean of its usable neighbours."""
+        if factor == 1:
+            return self
+        known = self.usable.astype(self.counts.dtype)
+        around = _sum_of_neighbours(self.counts * known)
+        number = _sum_of_neighbours(known)
+        filled = jnp.where(self.usable, self.counts, around / jnp.maximum(number, 1))
+        return Measurement(
+            sum_blocks(filled, factor),
+            sum_blocks(known, factor) > factor**2 / 2,
+            self.read_variance * factor**2,
+        )
+
+
+class Level(eqx.Module):
+    """The sensor at one resolution, with what its iterations need.
+
+    Attributes:
+        optics: The sensor on the grid of the model.
+        light: Light of each pixel over that of a fully lit one.
+        power: Expected power of the phase, one filter for each cutoff.
+        low_pass: Factor on the spectrum of the returning light.
+        binning: Detector pixels per measured pixel of this level, along an axis.
+        oversampling: Cells of the model per measured pixel of this level, along an axis.
+        iterations: Most iterations for each cutoff.
+        gain: Length of a step.
+        tolerance_rad: An iteration that moves less ends the level.
+    """
+
+    optics: CurvatureSensor
+    light: Float[Array, "y x"]
+    power: Float[Array, "cutoff y fx"]
+    low_pass: Float[Array, "y x"]
+    binning: int = eqx.field(static=True)
+    oversampling: int = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+    gain: float = eqx.field(static=True)
+    tolerance_rad: float = eqx.field(static=True)
+
+    def on_pixels(self, photons: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
+        """What the measured pixels see of light on the model's grid."""
+        return sum_blocks(photons, self.oversampling)
+
+    def on_cells(self, factor: Float[Array, "plane v u"]) -> Float[Array, "plane y x"]:
+        """A factor per measured pixel, on the model's grid."""
+        for axis in (1, 2) if self.oversampling > 1 else ():
+            factor = jnp.repeat(factor, self.oversampling, axis=axis)
+        return factor
+
+
+def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "plane v u"]:
+    """Sum over squares of `factor` x `factor` pixels."""
+    if factor == 1:
+        return array
+    planes, rows, columns = array.shape
+    return array.reshape(planes, rows // factor, factor, columns // factor, factor).sum(axis=(2, 4))
+
+
+def resample_phase(phase_rad: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:
+    """The same smooth phase over the same window, on another number of pixels."""
+    if phase_rad.shape == shape:
+        return phase_rad
+    return jax.image.resize(phase_rad, shape, method="cubic").astype(phase_rad.dtype)
+
+
+def lit_fraction(pupil: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
+    """Light of each pixel over that of a fully lit one."""
+    return np.asarray(pupil) ** 2 / np.max(np.asarray(pupil) ** 2)
+
+
+def _sum_of_neighbours(array: Float[Array, "plane y x"]) -> Float[Array, "plane y x"]:
+    rows = sum(jnp.roll(array, shift, axis=1) for shift in (-1, 0, 1))
+    return sum((jnp.roll(rows, shift, axis=2) for shift in (-1, 0, 1)), jnp.zeros_like(array))

@@ -1,0 +1,60 @@
+"""Smoothing a phase as turbulence is smooth: the filter inside the loop."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nlcwfs.atmosphere.phase_screen import Turbulence
+from nlcwfs.beam.grid import Grid
+
+
+def half_plane_frequencies(grid: Grid) -> Float[np.ndarray, "y fx"]:
+    """Moduli of the spatial frequencies of a real Fourier transform (`rfft2`), cycles per metre."""
+    return np.hypot(grid.fy_per_m, np.fft.rfftfreq(grid.shape[1], grid.pixel_m)[None, :])
+
+
+def expected_power(
+    grid: Grid, turbulence: Turbulence, *, wavelength_m: float, cutoff_per_m: float | None
+) -> Float[np.ndarray, "y fx"]:
+    """Variance of each Fourier coefficient of turbulent phase, where white noise of unit variance has 1.
+
+    Args:
+        grid: Pixels of the phase.
+        turbulence: Strength of the air.
+        wavelength_m: Wavelength at which the phase counts.
+        cutoff_per_m: Finest wave wanted; what is beyond falls with the 8th power. None keeps all.
+
+    Examples:
+        >>> from nlcwfs.atmosphere.phase_screen import Turbulence
+        >>> from nlcwfs.beam.grid import Grid
+        >>> air = Turbulence.from_seeing(seeing_arcsec=0.6)
+        >>> power = expected_power(Grid((8, 8), 0.5), air, wavelength_m=0.85e-6, cutoff_per_m=None)
+        >>> power.shape, bool(power[0, 1] > power[0, 2])
+        ((8, 5), True)
+    """
+    frequency_per_m = half_plane_frequencies(grid)
+    # Kolmogorov's spectrum has no end towards zero; half the first frequency stands for what is below it.
+    lowest_per_m = 0.5 / max(grid.width_m)
+    opd_spectrum = turbulence.opd_spectrum(np.maximum(frequency_per_m, lowest_per_m))
+    power = opd_spectrum * (2 * np.pi / wavelength_m) ** 2 / grid.pixel_m**2
+    if cutoff_per_m is not None:
+        power = power / (1 + (frequency_per_m / cutoff_per_m) ** 8)
+    return power
+
+
+def smooth_like_turbulence(
+    phase_rad: Float[Array, "y x"],
+    power: Float[Array, "y fx"],
+    noise_variance: float | Float[Array, ""],
+) -> Float[Array, "y x"]:
+    """Wiener's filter: each wave is kept by `power / (power + noise_variance)`.
+
+    Args:
+        phase_rad: A phase that is not wrapped, on a periodic grid.
+        power: See `expected_power`.
+        noise_variance: Variance of white noise per pixel, rad^2.
+    """
+    spectrum = jnp.fft.rfft2(phase_rad)
+    kept = power / (power + noise_variance)
+    filtered = jnp.fft.irfft2(spectrum * kept.astype(spectrum.dtype), s=phase_rad.shape)
+    return filtered.astype(phase_rad.dtype)

@@ -1,0 +1,109 @@
+"""From a wrapped phase to a wavefront: unwrapping and modal filtering in one linear projection."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nlcwfs.beam.modes import ModalBasis
+
+WEAKEST_DIRECTION = 1e-3
+"""Combinations of modes whose slopes are this much weaker than the strongest are left to the remainder."""
+
+
+class SlopeUnwrapper(eqx.Module):
+    """Fits the slopes of modes to the wrapped slopes of a phase (Guyon 2010, sec. 3.2).
+
+    The difference of neighbouring pixels does not feel the wraps, once brought into -pi..pi. Its projection on
+    the slopes of the modes unwraps and filters in one matrix product. But slopes alone forget what the sensor
+    knows of the low orders: their noise adds up across the pupil as in a Shack-Hartmann sensor. So the wrapped
+    remainder is projected on the modes afterwards, and added.
+
+    Attributes:
+        modes: On the lit pixels, one row each.
+        weights: Share of the light of each lit pixel, sum 1.
+        from_slopes: Coefficients for one radian of difference on each pair of neighbours.
+        passes: How often the remainder is projected back.
+    """
+
+    modes: Float[Array, "mode lit"]
+    weights: Float[Array, " lit"]
+    from_slopes: Float[Array, "mode pair"]
+    lit: tuple[np.ndarray, np.ndarray] = eqx.field(static=False)
+    first: np.ndarray
+    second: np.ndarray
+    passes: int = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, basis: ModalBasis, *, passes: int, dtype: str = "float32") -> "SlopeUnwrapper":
+        """Precompute the projection of slopes for a basis.
+
+        Args:
+            basis: Modes on the pixels of the phase.
+            passes: How often the wrapped remainder is projected back on the modes.
+            dtype: Precision of the projection.
+
+        Examples:
+            >>> from nlcwfs.beam.grid import Grid
+            >>> from nlcwfs.beam.modes import modal_basis
+            >>> from nlcwfs.beam.pupil import circular_pupil
+            >>> grid = Grid((24, 24), pixel_m=0.4)
+            >>> basis = modal_basis(circular_pupil(grid, diameter_m=8.0), grid, diameter_m=8.0, count=20)
+            >>> phase_rad = basis.combine(np.r_[9.0, np.zeros(19)])  # 9 rad rms of tilt: many wraps
+            >>> wrapped_rad = jnp.angle(jnp.exp(1j * phase_rad.astype(complex)))
+            >>> unwrapper = SlopeUnwrapper.build(basis, passes=2, dtype="float64")
+            >>> round(float(unwrapper.coefficients(wrapped_rad)[0]), 6)
+            9.0
+        """
+        weights = np.asarray(basis.weights)
+        rows, columns = np.nonzero(weights > 0)
+        number = np.full(weights.shape, -1)
+        number[rows, columns] = np.arange(rows.size)
+        pairs = [
+            (number[:, :-1], number[:, 1:]),
+            (number[:-1, :], number[1:, :]),
+        ]
+        first = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
+        second = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+        modes = np.asarray(basis.modes, float)[:, rows, columns]
+        lit_weights = weights[rows, columns]
+        pair_weights = np.minimum(lit_weights[first], lit_weights[second])
+        slopes = (modes[:, second] - modes[:, first]) * np.sqrt(pair_weights)
+        from_slopes = np.linalg.pinv(slopes.T, rcond=WEAKEST_DIRECTION) * np.sqrt(pair_weights)
+        return cls(
+            modes=jnp.asarray(modes, dtype),
+            weights=jnp.asarray(lit_weights, dtype),
+            from_slopes=jnp.asarray(from_slopes, dtype),
+            lit=(rows, columns),
+            first=first,
+            second=second,
+            passes=passes,
+        )
+
+    def coefficients(self, wrapped_rad: Float[Array, "y x"]) -> Float[Array, " mode"]:
+        """Coefficients of the unwrapped phase, in radians.
+
+        Args:
+            wrapped_rad: Phase on the pixels of the basis; whole turns do not matter, nor does what lies
+                outside the pupil.
+        """
+        phase_rad = wrapped_rad[self.lit[0], self.lit[1]].astype(self.modes.dtype)
+        found = self.from_slopes @ wrap(phase_rad[self.second] - phase_rad[self.first])
+        for _ in range(self.passes):
+            remainder = phase_rad - found @ self.modes
+            # The common phase of the remainder is piston: take it out before it wraps.
+            real, imaginary = jnp.cos(remainder) @ self.weights, jnp.sin(remainder) @ self.weights
+            remainder = wrap(remainder - jnp.arctan2(imaginary, real))
+            found = found + self.modes @ (self.weights * remainder)
+        return found
+
+
+def wrap(phase_rad: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Bring a phase into -pi..pi by whole turns.
+
+    Examples:
+        >>> import jax.numpy as jnp
+        >>> round(float(wrap(jnp.asarray(7.0))), 4)
+        0.7168
+    """
+    return phase_rad - 2 * np.pi * jnp.round(phase_rad / (2 * np.pi))

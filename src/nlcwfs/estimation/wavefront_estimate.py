@@ -1,0 +1,36 @@
+"""What an estimator says about a wavefront."""
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+from nlcwfs.estimation.outcome import Outcome
+
+
+class WavefrontEstimate(eqx.Module):
+    """A wavefront with the account of how it was found; batches carry a leading frame axis.
+
+    Attributes:
+        opd_m: Unwrapped optical path difference on the frames' pixels, zero mean over the pupil. It goes on
+            smoothly beyond the pupil, where it means nothing.
+        predicted_error_m: Expected rms error over the pupil, from photon noise and turbulence; one sigma.
+        misfit: How badly the model explains the counts: 1 if by noise alone, see `fit_quality`.
+        residual: Counts minus model, photo-electrons.
+        iterations: Iterations, over all resolutions.
+        ffts: Two-dimensional FFTs of one plane, over all resolutions.
+        outcome_code: `Outcome` as a number.
+        strength: Variance of the turbulence over that of 0.6" seeing, as given or as measured.
+    """
+
+    opd_m: Float[Array, "*frame y x"]
+    predicted_error_m: Float[Array, "*frame"]
+    misfit: Float[Array, "*frame"]
+    residual: Float[Array, "*frame plane y x"]
+    iterations: Int[Array, "*frame"]
+    ffts: Int[Array, "*frame"]
+    outcome_code: Int[Array, "*frame"]
+    strength: Float[Array, "*frame"]
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the estimate of one frame ended."""
+        return Outcome(int(self.outcome_code))
