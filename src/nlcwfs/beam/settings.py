@@ -17,26 +17,29 @@ class BeamSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    diameter_m: float = Field(8.0, gt=0, allow_inf_nan=False, description="Diameter of the telescope.")
+    diameter_m: float = Field(default=8.0, ge=0.01, le=100, description="Diameter of the telescope.")
     obstruction_ratio: float = Field(
-        0.0, ge=0, lt=1, description="Diameter of the central obstruction over that of the telescope."
+        default=0.0, ge=0, lt=1, description="Diameter of the central obstruction over that of the telescope."
     )
-    spider_count: int = Field(0, ge=0, le=64, description="Number of vanes that hold the secondary mirror.")
+    spider_count: int = Field(
+        default=0, ge=0, le=64, description="Number of vanes that hold the secondary mirror."
+    )
     spider_width_m: float = Field(
-        0.05, gt=0, allow_inf_nan=False, description="Width of a vane; unused without vanes."
+        default=0.05, gt=0, allow_inf_nan=False, description="Width of a vane; unused without vanes."
     )
     spider_angle_deg: float = Field(
-        0.0,
+        default=0.0,
         ge=-360,
         le=360,
         description="Angle of the first vane from +x towards +y; the others follow at equal angles.",
     )
     pupil_map: Path | None = Field(
-        None,
+        default=None,
+        examples=["pupil.fits"],
         description="FITS image of the pupil's amplitude, 0 to 1; replaces circle, obstruction and vanes.",
     )
     wavelength_um: float = Field(
-        0.85, gt=0, le=100, description="Wavelength at which the sensor works, in micrometres."
+        default=0.85, ge=0.2, le=30, description="Wavelength at which the sensor works."
     )
 
     @model_validator(mode="after")
