@@ -68,18 +68,18 @@ class Config(BaseModel):
 
 
 def cross_checks(config: Config) -> None:
-    """Refuse sections that are each valid but do not go together.
+    """Refuse sections that are each valid but cannot go together.
+
+    Only what takes no time: the images themselves are not computed here. What a sampling that can work
+    costs is for `beam.sampling.check_sampling` to say, before light travels.
 
     Raises:
-        SettingsError: If the light's window is not wider than the pupil.
+        SettingsError: If the window of the detector does not hold the pupil.
     """
-    detector, simulation = config.detector, config.simulation
-    if simulation.light_window * detector.window_pixels < detector.pixels_across_pupil:
-        rule = (
-            f"must, times detector.window_pixels ({detector.window_pixels}), "
-            f"be at least detector.pixels_across_pupil ({detector.pixels_across_pupil})"
-        )
-        raise SettingsError("simulation.light_window", rule, simulation.light_window)
+    window, pupil = config.detector.window_pixels, config.detector.pixels_across_pupil
+    if window < pupil:
+        rule = f"must be at least detector.pixels_across_pupil ({pupil}) to hold the pupil"
+        raise SettingsError("detector.window_pixels", rule, window)
 
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:

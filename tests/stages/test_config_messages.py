@@ -3,6 +3,7 @@
 import json
 import pickle
 import re
+import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -78,8 +79,7 @@ BAD_VALUES = {
         "beam.spider_width_m: must be smaller than diameter_m, got its default"
     ),
     "[detector]\nwindow_pixels = 40": (
-        "simulation.light_window: must, times detector.window_pixels (40), "
-        "be at least detector.pixels_across_pupil (90), got 2.0"
+        "detector.window_pixels: must be at least detector.pixels_across_pupil (90) to hold the pupil, got 40"
     ),
 }
 

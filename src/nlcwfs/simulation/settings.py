@@ -23,8 +23,8 @@ class SimulationSettings(BaseModel):
         default=4, ge=2, le=32, description="Cells of the light's grid along a side of a detector pixel."
     )
     light_window: float = Field(
-        # D + 2 z alpha of Guyon 2010, sec. 2.5, is 18 m for the farthest plane of Table 1 with alpha = 0.3
-        # arcsec, half of its seeing; twice the default window of the detector is 22.8 m.
+        # D + 2 z alpha of Guyon 2010, sec. 2.5, is 19.9 m for the farthest plane of Table 1 with alpha = 16
+        # lambda / D, wider than half its seeing; twice the default window of the detector is 22.8 m.
         default=2.0,
         ge=1,
         le=16,
