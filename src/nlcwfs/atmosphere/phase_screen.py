@@ -59,6 +59,8 @@ class Turbulence:
         """The Kolmogorov air whose mean rms over a disc, tilt included, is given (Noll 1976: 1.0299 (D/r0)^(5/3))."""
         if not opd_rms_m > 0:
             raise SettingsError("atmosphere.opd_rms_nm", "must be a positive length", opd_rms_m * 1e9)
+        if not diameter_m > 0:
+            raise SettingsError("diameter_m", "must be a positive length", diameter_m)
         phase_variance = (2 * math.pi * opd_rms_m / SEEING_WAVELENGTH_M) ** 2
         return cls(diameter_m * (1.0299 / phase_variance) ** 0.6)
 
@@ -69,7 +71,9 @@ class Turbulence:
     def opd_spectrum(self, frequency_per_m: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Power spectrum of the OPD in m^2 per (cycle/m)^2 (Noll 1976, eq. 21, in OPD)."""
         squared = np.asarray(frequency_per_m) ** 2 + self.outer_scale_m**-2
-        return 0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
+        return (
+            0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
+        )
 
 
 class PhaseScreens(eqx.Module):
@@ -109,9 +113,12 @@ class PhaseScreens(eqx.Module):
         step_per_m = 1 / (period * pixel_m)
         frequency = np.fft.fftfreq(period, pixel_m)
         radius = np.hypot(frequency[:, None], frequency[None, :])
-        central = (np.abs(frequency[:, None]) < 1.5 * step_per_m) & (np.abs(frequency[None, :]) < 1.5 * step_per_m)
+        central = (np.abs(frequency[:, None]) < 1.5 * step_per_m) & (
+            np.abs(frequency[None, :]) < 1.5 * step_per_m
+        )
         radius = np.maximum(radius, step_per_m)
-        power = turbulence.opd_spectrum(radius) * (1 + (11 / 3) ** 2 / 24 * (step_per_m / radius) ** 2)
+        # The mean of f^2 f^(-11/3) over a cell, to second order: as below, each wave has its cell's mean slope.
+        power = turbulence.opd_spectrum(radius) * (1 + (5 / 3) ** 2 / 24 * (step_per_m / radius) ** 2)
         amplitude = np.where(central, 0, np.sqrt(power) * step_per_m)
         low_y, low_x, low_step = _low_frequencies(1.5 * step_per_m)
         low = np.sqrt(_slope_power(turbulence, low_y, low_x, low_step)) * low_step
