@@ -31,7 +31,7 @@ def fresnel_transfer(
         >>> complex(transfer[0, 0])
         (1+0j)
     """
-    if not wavelength_m > 0:
+    if not 0 < wavelength_m < np.inf:
         raise SamplingError("wavelength_m", "must be a positive length", wavelength_m)
     if not np.isfinite(distance_m):
         raise SamplingError("distance_m", "must be a finite length", distance_m)

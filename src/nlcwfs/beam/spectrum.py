@@ -27,7 +27,10 @@ class Spectrum:
     shares: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if not self.wavelengths_m or min(self.wavelengths_m) <= 0:
+        # Python's numbers take the precision of the light; NumPy's would impose theirs.
+        object.__setattr__(self, "wavelengths_m", tuple(map(float, self.wavelengths_m)))
+        object.__setattr__(self, "shares", tuple(map(float, self.shares)))
+        if not self.wavelengths_m or not all(0 < wavelength < np.inf for wavelength in self.wavelengths_m):
             raise SettingsError("spectrum.wavelengths_m", "must be positive lengths", self.wavelengths_m)
         if len(self.shares) != len(self.wavelengths_m):
             raise SettingsError("spectrum.shares", "must be one per wavelength", self.shares)

@@ -94,10 +94,16 @@ class CurvatureSensor(eqx.Module):
             raise SettingsError("curvature_sensor.distances_m", "must be finite, at least one", distances)
         fractions = np.full(len(distances), 1 / len(distances)) if flux_fractions is None else flux_fractions
         fractions = np.asarray(fractions, float)
-        if fractions.shape != (len(distances),) or fractions.min() <= 0 or abs(fractions.sum() - 1) > 1e-6:
+        shared = (
+            fractions.shape == (len(distances),) and fractions.min() > 0 and abs(fractions.sum() - 1) <= 1e-6
+        )
+        if not shared:  # NaN included
             raise SettingsError(
                 "curvature_sensor.flux_fractions", "must be one per plane, positive, sum 1", fractions
             )
+        if not np.all(np.isfinite(pupil)):
+            bad = np.size(pupil) - np.isfinite(pupil).sum()
+            raise SettingsError("pupil", "must be finite", f"{bad} pixels that are not")
         if not np.any(pupil):
             raise SettingsError("pupil", "must let some light through", "zeros everywhere")
         static = np.zeros_like(pupil, float) if static_opd_m is None else static_opd_m
