@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -147,17 +148,16 @@ def test_a_stamp_without_seed_has_no_seed_keyword(tmp_path):
     assert read_provenance(tmp_path / "bare.fits").commit == "unknown"
 
 
-def test_the_commit_is_that_of_the_checkout_or_unknown(monkeypatch):
+def test_the_commit_is_that_of_the_checkout_or_unknown():
     checkout = Path(provenance.__file__).resolve().parents[3]
     provenance._commit.cache_clear()
     commit = Provenance.collect({}, seed=None, device="cpu").commit
-    if (checkout / ".git").exists():
-        head = subprocess.run(
-            ["git", "-C", str(checkout), "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        )
-        assert commit.removesuffix("-dirty") == head.stdout.strip()
-    else:
-        assert commit == "unknown"
+    head = checkout / ".git" / "HEAD"
+    if shutil.which("git") is None or not head.is_file():
+        pytest.skip("not a checkout with git")
+    run = subprocess.run(["git", "-C", str(checkout), "rev-parse", "HEAD"], capture_output=True, text=True)
+    expected = run.stdout.strip() if run.returncode == 0 else "unknown"  # git may distrust a folder's owner
+    assert commit.removesuffix("-dirty") == expected
 
 
 @pytest.mark.parametrize(
