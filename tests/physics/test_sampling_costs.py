@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import fft
 
-from nlcwfs.beam.sampling import SensedLight, light_outside, pixel_error, wrapping_error
+from nlcwfs.beam.sampling_cost import SensedLight, light_outside, pixel_error, wrapping_error
 
 DIAMETER_M, WAVELENGTH_M = 8.0, 0.85e-6
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from nlcwfs.beam.sampling import SensedLight, check_sampling, light_outside, pixel_error, sampling_needed
+from nlcwfs.beam.sampling import check_sampling, sampling_needed
+from nlcwfs.beam.sampling_cost import SensedLight, light_outside, pixel_error
 from nlcwfs.errors import SamplingError
 
 LIGHT = SensedLight(diameter_m=8.0, wavelength_m=0.85e-6)

@@ -6,7 +6,6 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 from jaxtyping import Array, Float
 
 from nlcwfs.beam.disc_harmonics import orthonormal_shells, sample_waves
@@ -201,14 +200,14 @@ def _kolmogorov_covariance(
     y = np.fft.fftfreq(2 * ny, 1 / (2 * ny))[:, None] * pixel
     # One part in a thousand of anisotropy settles which way the twins (cos and sin) turn, on any machine.
     x = np.fft.fftfreq(2 * nx, 1 / (2 * nx))[None, :] * pixel * 1.001
-    kernel = scipy.fft.rfft2(-KOLMOGOROV_STRUCTURE / 2 * np.hypot(y, x) ** (5 / 3))
+    kernel = np.fft.rfft2(-KOLMOGOROV_STRUCTURE / 2 * np.hypot(y, x) ** (5 / 3))
     smeared = np.empty_like(columns)
     for first in range(0, columns.shape[1], 32):  # a few at a time: memory
         part = slice(first, first + 32)
         images = np.zeros((columns[:, part].shape[1], ny, nx))
         images[:, lit] = (columns[:, part] * root[:, None]).T
-        spectra = scipy.fft.rfft2(images, s=(2 * ny, 2 * nx)) * kernel
-        smeared[:, part] = scipy.fft.irfft2(spectra, s=(2 * ny, 2 * nx))[:, :ny, :nx][:, lit].T
+        spectra = np.fft.rfft2(images, s=(2 * ny, 2 * nx)) * kernel
+        smeared[:, part] = np.fft.irfft2(spectra, s=(2 * ny, 2 * nx))[:, :ny, :nx][:, lit].T
     covariance = columns.T @ (smeared * root[:, None])
     return (covariance + covariance.T) / 2
 
