@@ -108,14 +108,14 @@ def modal_basis(
 
     Measured, 820 modes on 45 and 90 pixels: condition of the waves 1.5 and 1.1 on a circle, 5e6 and 2e6 with
     an obstruction of 0.3 and vanes, 9e5 and 5e4 on seven segments, 9e14 on four separate discs (90 pixels);
-    of the modes always 1 + 1e-14. Built in 1 to 3 s on one core (run BLAS on one thread when others compute).
-    A circle has 645 to 648 modes up to 16 cycles per aperture (655 disc harmonics); four discs have 243.
+    of the modes always 1 + 1e-14. Built in 1.4 s and 4.6 s on one core (run BLAS on one thread when others
+    compute). A circle has 648 and 645 modes up to 16 cycles per aperture, of disc harmonics 655.
 
-    Why Karhunen-Loeve is the default: the part of Kolmogorov turbulence left by 2, 20, 200 and 820 modes on 45
-    pixels, in rad^2 for D / r0 = 1, is 0.1323, 0.0176, 0.0023, 0.0005, within 1 % of the best that any modes
-    can do; disc harmonics with tilt in front leave 0.1332, 0.0186, 0.0023, 0.0005, without tilt ten times as
-    much at first, and Zernikes 0.1330, 0.0206, 0.0030, 0.0007 with a condition of 2e6. Disc harmonics keep
-    each mode at one frequency; with gaps in the pupil they need a third more modes than Karhunen-Loeve.
+    Why Karhunen-Loeve is the default: the part of Kolmogorov turbulence left by 2, 20, 200 and 820 modes on
+    45 pixels, in rad^2 for D / r0 = 1, is 0.1323, 0.0176, 0.0023, 0.0005, within 1 % of the best that any
+    modes can do; disc harmonics with tilt in front leave 0.1332, 0.0186, 0.0024, 0.0006, and Zernikes 0.1330,
+    0.0206, 0.0030, 0.0007 with a condition of 2e6 before orthonormalisation. On four separate discs disc
+    harmonics leave 20 % more. They keep each mode at one frequency, which is what they are there for.
 
     Args:
         diameter_m: Unit of `cycles_per_aperture`; also of D / r0 in `kolmogorov_rad2`.
