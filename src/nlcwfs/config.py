@@ -162,9 +162,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # editors on Windows may write a byte order mark
     except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path}: must be UTF-8 text, got byte {error.object[error.start]:#04x}"
-        ) from None
+        raise FileFormatError(f"{path}: must be UTF-8 text, got byte {error.object[error.start]:#04x}") from None
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file") from None
     except OSError as error:
@@ -178,9 +176,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 def _parse_override(text: str) -> tuple[list[str], Any]:
     """Split `section.key=value` into the path of the key and its value; None means the default."""
-    if any(
-        "\ud800" <= character <= "\udfff" for character in text
-    ):  # how Python holds bytes that are no text
+    if any("\ud800" <= character <= "\udfff" for character in text):  # how Python holds bytes that are no text
         raise SettingsError("--set", "must be UTF-8 text", ascii(text))
     name, equals, written = (part.strip() for part in text.partition("="))
     keys = [key.strip() for key in name.split(".")]

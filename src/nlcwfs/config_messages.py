@@ -88,9 +88,7 @@ def _problem(model: type[BaseModel], details: ErrorDetails) -> str:
     keys, owner, rule = _place(model, details["loc"])
     value, kind = details["input"], details["type"]
     if kind == "extra_forbidden":
-        return unknown_key(model, [str(key) for key in keys], value) or _line(
-            _dotted(keys), "unknown key", value
-        )
+        return unknown_key(model, [str(key) for key in keys], value) or _line(_dotted(keys), "unknown key", value)
     if kind == "value_error":
         return _own_rule(keys, owner, str(details.get("ctx", {}).get("error", details["msg"])), value)
     if kind == "missing":
@@ -136,9 +134,7 @@ def _place(
 
 def _section_type(annotation: Any, *, name: str | None = None) -> type[BaseModel] | None:
     """The settings class that a key holds; among alternatives the one of this name."""
-    options = [
-        each for each in unwrap(annotation)[0] if isinstance(each, type) and issubclass(each, BaseModel)
-    ]
+    options = [each for each in unwrap(annotation)[0] if isinstance(each, type) and issubclass(each, BaseModel)]
     if name is not None:
         options = [each for each in options if each.__name__ == name]
     return options[0] if len(options) == 1 else None
@@ -182,9 +178,7 @@ def _all_keys(section: type[BaseModel], above: str = "") -> Iterator[tuple[str, 
 
 def _dotted(keys: Sequence[str | int]) -> str:
     """The path of a key as a user writes it; an item of a list, counted from 0, in brackets."""
-    return "".join(f"[{key}]" if isinstance(key, int) else f".{toml_key(key)}" for key in keys).removeprefix(
-        "."
-    )
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{toml_key(key)}" for key in keys).removeprefix(".")
 
 
 def _line(path: str, rule: str, value: object) -> str:

@@ -11,9 +11,7 @@ from pydantic.fields import FieldInfo
 
 UNITS: Mapping[str, str] = {
     **{unit: unit for unit in ("m", "km", "cm", "mm", "um", "nm", "s", "ms", "us", "deg", "rad", "mrad")},
-    **{
-        unit: unit for unit in ("arcsec", "arcmin", "mas", "pixels", "electrons", "photons", "adu", "percent")
-    },
+    **{unit: unit for unit in ("arcsec", "arcmin", "mas", "pixels", "electrons", "photons", "adu", "percent")},
     **{"hz": "Hz", "khz": "kHz", "mhz": "MHz", "micron": "um", "microns": "um"},
 }
 """Last words of keys that are units, and how they are printed."""

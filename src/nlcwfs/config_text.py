@@ -41,9 +41,7 @@ def toml_value(value: Any) -> str:
         case BaseModel():
             return toml_value(dict(value))
         case dict():
-            pairs = (
-                f"{toml_key(key)} = {toml_value(item)}" for key, item in value.items() if item is not None
-            )
+            pairs = (f"{toml_key(key)} = {toml_value(item)}" for key, item in value.items() if item is not None)
             return f"{{{', '.join(pairs)}}}"
         case _:
             raise TypeError(f"TOML cannot hold a {type(value).__name__}")
@@ -71,9 +69,7 @@ def plain_toml(settings: BaseModel) -> str:
     """
     blocks = []
     for path, section in _sections(settings):
-        keys = [
-            f"{toml_key(key)} = {toml_value(value)}" for key, value in _keys(section) if value is not None
-        ]
+        keys = [f"{toml_key(key)} = {toml_value(value)}" for key, value in _keys(section) if value is not None]
         blocks.append("\n".join([*_header(path), *keys]))
     return "\n\n".join(blocks) + "\n"
 
@@ -98,9 +94,7 @@ def commented_toml(settings: BaseModel, *, ruled_by_another: Collection[str] = (
     for path, section in _sections(settings):
         header = _header(path)
         if header:
-            blocks.append(
-                "\n".join([*_comment((type(section).__doc__ or "").strip().split("\n")[0]), *header])
-            )
+            blocks.append("\n".join([*_comment((type(section).__doc__ or "").strip().split("\n")[0]), *header]))
         for key, value in _keys(section):
             field = type(section).model_fields[key]
             mark = "#" if value is None or ".".join((*path, key)) in ruled_by_another else ""

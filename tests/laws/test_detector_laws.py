@@ -104,9 +104,7 @@ def test_rounding_errs_by_half_a_step_at_most(seed, step, em_gain, bias_adu):
     st.sampled_from(["f4", "f8"]),
 )
 def test_every_code_survives_electrons_and_back(step, em_gain, bias_adu, bits, dtype):
-    camera = Detector(
-        DetectorSettings(bits=bits, gain_electrons_per_adu=step, em_gain=em_gain, bias_adu=bias_adu)
-    )
+    camera = Detector(DetectorSettings(bits=bits, gain_electrons_per_adu=step, em_gain=em_gain, bias_adu=bias_adu))
     codes = np.linspace(0, 2**bits - 1, 999).round()
     back = camera.to_adu(camera.to_electrons(jnp.asarray(codes, dtype)))
     np.testing.assert_array_equal(back, codes)

@@ -44,9 +44,7 @@ def travel(field: np.ndarray, distance_m: float) -> np.ndarray:
     return np.asarray(propagate_fresnel(jnp.asarray(field), distance_m=distance_m, **LIGHT))
 
 
-def sensor_of(
-    pupil: np.ndarray, distances_m, *, wavelength_m: float = WAVELENGTH_M, **options
-) -> CurvatureSensor:
+def sensor_of(pupil: np.ndarray, distances_m, *, wavelength_m: float = WAVELENGTH_M, **options) -> CurvatureSensor:
     options.setdefault("spectrum", Spectrum.monochromatic(wavelength_m))
     grid = Grid(pupil.shape, PIXEL_M)
     return CurvatureSensor.build(pupil, grid, distances_m=distances_m, dtype="float64", **options)
@@ -135,9 +133,7 @@ def test_travel_is_the_sum_of_its_plane_waves(seed, shape, distance_m):
     waves_y = np.exp(2j * np.pi * np.outer(rows, order_y) / shape[0])
     waves_x = np.exp(2j * np.pi * np.outer(columns, order_x) / shape[1])
     strength = waves_y.conj().T @ near @ waves_x.conj() / near.size
-    squared_y, squared_x = (
-        (order / (n * PIXEL_M)) ** 2 for order, n in zip((order_y, order_x), shape, strict=True)
-    )
+    squared_y, squared_x = ((order / (n * PIXEL_M)) ** 2 for order, n in zip((order_y, order_x), shape, strict=True))
     delay_rad = np.pi * WAVELENGTH_M * distance_m * (squared_y[:, None] + squared_x[None, :])
     expected = waves_y @ (strength * np.exp(-1j * delay_rad)) @ waves_x.T
     np.testing.assert_allclose(travel(near, distance_m), expected, atol=10 * ROUNDING)  # phases of 100 rad
@@ -164,9 +160,7 @@ def test_the_far_field_is_the_sum_over_the_pupil(seed, shape, wide):
 @given(seed=seeds, size=st.sampled_from([9, 12]))
 def test_all_the_light_is_on_the_sky(seed, size):
     near = random_field(seed, (size, size))
-    sky = Grid(
-        (size, size), WAVELENGTH_M / (size * PIXEL_M)
-    )  # one period of the directions a grid can tell apart
+    sky = Grid((size, size), WAVELENGTH_M / (size * PIXEL_M))  # one period of the directions a grid can tell apart
     far = propagate_fraunhofer(jnp.asarray(near), angles=sky, **LIGHT)
     np.testing.assert_allclose(np.sum(abs(np.asarray(far)) ** 2), np.sum(abs(near) ** 2), rtol=ROUNDING)
 
@@ -187,7 +181,7 @@ def test_a_longer_path_is_a_larger_phase(seed, shape, photons):
 
 
 @few
-@given(seed=seeds, shape=shapes, distance_m=distances)
+@given(seed=seeds, shape=shapes, distance_m=st.floats(2e5, 4e6))
 def test_the_images_are_what_the_pupil_sends(seed, shape, distance_m):
     pupil, opd_m = random_pupil(seed, shape), random_opd(seed, shape)
     got = images(sensor_of(pupil, (distance_m, -0.3 * distance_m)), opd_m)
@@ -201,9 +195,7 @@ def test_the_images_are_what_the_pupil_sends(seed, shape, distance_m):
 
 
 @few
-@given(
-    seed=seeds, shape=shapes, photons=st.floats(1e-3, 1e9), share=st.floats(0.01, 0.98), distance_m=distances
-)
+@given(seed=seeds, shape=shapes, photons=st.floats(1e-3, 1e9), share=st.floats(0.01, 0.98), distance_m=distances)
 def test_every_photon_lands_on_the_plane_that_owns_it(seed, shape, photons, share, distance_m):
     fractions = (share, 0.99 - share, 0.01)
     sensor = sensor_of(random_pupil(seed, shape), (distance_m, -2e6, 3e5), flux_fractions=fractions)
@@ -235,9 +227,7 @@ def test_a_shifted_pupil_gives_shifted_images(seed, shape, down, right):
 
     pupil, opd_m, distances_m = random_pupil(seed, shape), random_opd(seed, shape), (-2e6, 3e5)
     shifted = images(sensor_of(roll(pupil), distances_m), roll(opd_m))
-    np.testing.assert_allclose(
-        shifted, roll(images(sensor_of(pupil, distances_m), opd_m)), atol=1000 * ROUNDING
-    )
+    np.testing.assert_allclose(shifted, roll(images(sensor_of(pupil, distances_m), opd_m)), atol=1000 * ROUNDING)
 
 
 @few
@@ -271,9 +261,7 @@ def test_colours_add_their_photons(seed, shape, share):
 
 @few
 @given(seed=seeds, shape=shapes, wavelength_m=st.floats(0.4e-6, 2e-6))
-def test_the_same_phase_at_the_same_wavelength_times_distance_gives_the_same_images(
-    seed, shape, wavelength_m
-):
+def test_the_same_phase_at_the_same_wavelength_times_distance_gives_the_same_images(seed, shape, wavelength_m):
     pupil, opd_m = random_pupil(seed, shape), random_opd(seed, shape)
     ratio = wavelength_m / WAVELENGTH_M
     here = images(sensor_of(pupil, (-2e6, 3e5)), opd_m)
@@ -295,9 +283,7 @@ def test_the_slope_of_the_images_is_that_of_finite_differences(seed, shape):
         return sensor.images(opd, 1000.0).photons
 
     _, slope = jax.jvp(photons, (jnp.asarray(opd_m),), (jnp.asarray(direction_m),))
-    difference = (images(sensor, opd_m + step * direction_m) - images(sensor, opd_m - step * direction_m)) / (
-        2 * step
-    )
+    difference = (images(sensor, opd_m + step * direction_m) - images(sensor, opd_m - step * direction_m)) / (2 * step)
     np.testing.assert_allclose(slope, difference, atol=1e-6 * abs(difference).max())
 
 

@@ -49,9 +49,7 @@ def test_photon_noise_follows_the_law_of_poisson(mean):
 def test_bright_photon_noise_is_skewed_as_poisson_s_law():
     keys = jax.random.split(jax.random.key(13), 4)
     numbers = [np.ravel(sample_poisson(key, jnp.full(SHAPE, 1100.0))) for key in keys]
-    error = np.sqrt(
-        6 / (4 * COUNT)
-    )  # of a skewness of nearly normal numbers; five of them are 0.017 of 0.030
+    error = np.sqrt(6 / (4 * COUNT))  # of a skewness of nearly normal numbers; five of them are 0.017 of 0.030
     assert abs(stats.skew(np.concatenate(numbers)) - 1100**-0.5) < 5 * error
 
 
@@ -94,9 +92,7 @@ def test_one_electron_leaves_a_long_register_with_an_exponential_law():
     for level in (0.1, 1.0, 3.0):
         expected = np.exp(-level)
         error = np.sqrt(expected * (1 - expected) / out.size)
-        assert (
-            abs(np.mean(out > level * em_gain) - expected) < 5 * error + 1e-3
-        )  # 1 / G: law of a finite gain
+        assert abs(np.mean(out > level * em_gain) - expected) < 5 * error + 1e-3  # 1 / G: law of a finite gain
 
 
 CAMERAS = {

@@ -27,9 +27,7 @@ def centres_m(shape: tuple[int, int], pixel_m: float) -> tuple[np.ndarray, np.nd
 
 def travel(field: np.ndarray, distance_m: float, pixel_m: float) -> np.ndarray:
     near = jnp.asarray(field, complex)
-    return np.asarray(
-        propagate_fresnel(near, distance_m=distance_m, wavelength_m=WAVELENGTH_M, pixel_m=pixel_m)
-    )
+    return np.asarray(propagate_fresnel(near, distance_m=distance_m, wavelength_m=WAVELENGTH_M, pixel_m=pixel_m))
 
 
 # -------------------------------------------------------------------------------------------- Gaussian beam
@@ -102,9 +100,7 @@ def test_the_light_behind_a_disc_converges_to_the_exact_integral(distance_m, coa
 def test_the_exact_integral_agrees_with_its_value_on_the_axis():
     got = behind_a_disc(np.zeros(1), 2.5e6, disc_radius_m=4.0)[0]
     np.testing.assert_allclose(got, on_axis(2.5e6, 4.0), atol=1e-8)  # the quadrature's own tolerance
-    np.testing.assert_allclose(
-        abs(got) ** 2, 4 * np.sin(np.pi / 2 * 16 / (WAVELENGTH_M * 2.5e6)) ** 2, atol=1e-8
-    )
+    np.testing.assert_allclose(abs(got) ** 2, 4 * np.sin(np.pi / 2 * 16 / (WAVELENGTH_M * 2.5e6)) ** 2, atol=1e-8)
 
 
 @pytest.mark.parametrize("distance_m", [2.5e6, -2.5e6])
@@ -140,9 +136,7 @@ def gaussian_sensor(shape, pixel_m, distances_m) -> tuple[CurvatureSensor, np.nd
     pupil = np.exp(-(((x_m + 0.6) / 1.2) ** 2) - ((y_m - 0.9) / 1.0) ** 2)
     monochromatic = Spectrum.monochromatic(WAVELENGTH_M)
     grid = Grid(shape, pixel_m)
-    sensor = CurvatureSensor.build(
-        pupil, grid, distances_m=distances_m, spectrum=monochromatic, dtype="float64"
-    )
+    sensor = CurvatureSensor.build(pupil, grid, distances_m=distances_m, spectrum=monochromatic, dtype="float64")
     return sensor, y_m, x_m
 
 
@@ -195,9 +189,7 @@ def test_the_image_of_a_disc_is_airys():
     pixel_m, diameter_m = 0.05, 8.0
     disc = circular_pupil(Grid((163, 170), pixel_m), diameter_m=diameter_m)
     sky = Grid((41, 36), 0.2 * WAVELENGTH_M / diameter_m)
-    image = propagate_fraunhofer(
-        jnp.asarray(disc, complex), wavelength_m=WAVELENGTH_M, pixel_m=pixel_m, angles=sky
-    )
+    image = propagate_fraunhofer(jnp.asarray(disc, complex), wavelength_m=WAVELENGTH_M, pixel_m=pixel_m, angles=sky)
     v_rad, u_rad = centres_m((41, 36), sky.pixel_m)
     radial = np.pi * diameter_m / WAVELENGTH_M * np.hypot(v_rad, u_rad)
     peak = np.pi * diameter_m**2 / 4 * sky.pixel_m / (pixel_m * WAVELENGTH_M)

@@ -19,9 +19,7 @@ def draw_rad(turbulence, *, shape, pixel_m, count, seed) -> np.ndarray:
     """Phase of many screens at the wavelength where r0 holds."""
     screens = PhaseScreens.build(turbulence, shape=shape, pixel_m=pixel_m, dtype="float32")
     keys = jax.random.split(jax.random.key(seed), count)
-    return TO_RAD * np.asarray(
-        jax.jit(lambda keys: jax.lax.map(screens.draw, keys, batch_size=50))(keys), float
-    )
+    return TO_RAD * np.asarray(jax.jit(lambda keys: jax.lax.map(screens.draw, keys, batch_size=50))(keys), float)
 
 
 def structure(phase_rad: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -183,9 +181,7 @@ def test_the_same_key_gives_the_same_screen_and_another_key_an_unrelated_one():
 
 def test_screens_have_no_piston_and_scale_with_the_strength_of_the_air():
     weak, strong = (
-        np.asarray(
-            PhaseScreens.build(air, shape=(24, 31), pixel_m=0.2, dtype="float64").draw(jax.random.key(3))
-        )
+        np.asarray(PhaseScreens.build(air, shape=(24, 31), pixel_m=0.2, dtype="float64").draw(jax.random.key(3)))
         for air in (Turbulence(0.4), Turbulence(0.1))
     )
     # The mean is removed to the rounding of waves millions of times longer than the screen.

@@ -49,9 +49,7 @@ def hcipy_grid(shape, pixel_m):
 
 def travel(field: np.ndarray, distance_m: float, pixel_m: float) -> np.ndarray:
     return np.asarray(
-        propagate_fresnel(
-            jnp.asarray(field), distance_m=distance_m, wavelength_m=WAVELENGTH_M, pixel_m=pixel_m
-        )
+        propagate_fresnel(jnp.asarray(field), distance_m=distance_m, wavelength_m=WAVELENGTH_M, pixel_m=pixel_m)
     )
 
 
@@ -85,15 +83,11 @@ def test_fresnel_is_hcipys(distance_km, shape, pixel_m, sign, seed):
     near = aberrated_telescope(shape, pixel_m, seed=seed)
     distance_m = sign * distance_km * 1e3
     light = hcipy.Wavefront(hcipy.Field(near.ravel(), hcipy_grid(shape, pixel_m)), WAVELENGTH_M)
-    propagator = hcipy.FresnelPropagator(
-        light.grid, distance_m, num_oversampling=1
-    )  # it pads twice by itself
+    propagator = hcipy.FresnelPropagator(light.grid, distance_m, num_oversampling=1)  # it pads twice by itself
     theirs = np.asarray(propagator(light).electric_field).reshape(shape)
     ours = unpadded(travel(padded(near), distance_m, pixel_m))
     # Amplitudes of order 1. Short: rounding. Long: the kernel's sampling misses its ideal by 2e-4 of itself.
-    np.testing.assert_allclose(
-        ours, without_carrier(theirs, ours), atol=1e-12 if distance_km == 300 else 1e-4
-    )
+    np.testing.assert_allclose(ours, without_carrier(theirs, ours), atol=1e-12 if distance_km == 300 else 1e-4)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -176,6 +170,4 @@ def test_screens_follow_aotools_von_karman_structure_function(outer_scale_m):
 def test_seeing_is_that_of_aotools(seeing_arcsec):
     expected = aotools.seeing_to_r0(seeing_arcsec, 0.5e-6)
     # AOtools rounds 0.976 to 0.98.
-    np.testing.assert_allclose(
-        Turbulence.from_seeing(seeing_arcsec=seeing_arcsec).fried_m, expected, rtol=0.006
-    )
+    np.testing.assert_allclose(Turbulence.from_seeing(seeing_arcsec=seeing_arcsec).fried_m, expected, rtol=0.006)

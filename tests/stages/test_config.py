@@ -44,9 +44,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_fine(tmp_path):
 
 
 def test_overrides_are_stronger_than_the_file_and_the_last_one_wins(tmp_path):
-    path = write(
-        tmp_path, "seed = 1\n[beam]\ndiameter_m = 2\nspider_count = 3\n[atmosphere]\nopd_rms_nm = 609"
-    )
+    path = write(tmp_path, "seed = 1\n[beam]\ndiameter_m = 2\nspider_count = 3\n[atmosphere]\nopd_rms_nm = 609")
     config = load_config(
         path,
         ["beam.diameter_m=4", "beam.diameter_m = 6.5", "beam={spider_width_m=0.1}", "atmosphere.opd_rms_nm="],
@@ -171,9 +169,7 @@ def test_the_digest_does_not_know_the_order_of_keys(tmp_path):
     assert re.fullmatch(r"[0-9a-f]{16}", digest(one))
 
 
-@pytest.mark.parametrize(
-    "override", ["seed=1", "precision=double", "beam.diameter_m=8.1", "detector.bias_adu=1"]
-)
+@pytest.mark.parametrize("override", ["seed=1", "precision=double", "beam.diameter_m=8.1", "detector.bias_adu=1"])
 def test_the_digest_sees_every_change(override):
     assert digest(load_config(None, [override])) != digest(Config())
 

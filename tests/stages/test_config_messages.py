@@ -35,14 +35,11 @@ BAD_VALUES = {
     "[atmosphere]\nphotons = true": "atmosphere.photons: must be a number greater than 0, got true",
     "seed = 1.5": "seed: must be a whole number of at least 0 and below 4294967296, got 1.5",
     "[beam]\npupil_map = 3": "beam.pupil_map: must be a path, as text, got 3",
-    "[beam]\nspider_count = 2020-01-01": (
-        'beam.spider_count: must be a whole number from 0 to 64, got "2020-01-01"'
-    ),
+    "[beam]\nspider_count = 2020-01-01": ('beam.spider_count: must be a whole number from 0 to 64, got "2020-01-01"'),
     "beam = 3": "beam: must be a section of keys, got 3",
     "[[beam]]\ndiameter_m = 8": "beam: must be a section of keys, got [{diameter_m = 8}]",
     "[curvature_sensor]\ndistances_km = 3500": (
-        "curvature_sensor.distances_km: must be a list of 1 or more numbers from -1000000 to 1000000 [km], "
-        "got 3500"
+        "curvature_sensor.distances_km: must be a list of 1 or more numbers from -1000000 to 1000000 [km], got 3500"
     ),
     '[curvature_sensor]\ndistances_km = [1, "2"]': (
         'curvature_sensor.distances_km[1]: must be a number from -1000000 to 1000000 [km], got "2"'
@@ -59,16 +56,13 @@ BAD_VALUES = {
         "simulation.light_oversampling: must be a whole number from 2 to 32, got 1"
     ),
     # a value that makes sense in another unit only
-    "[beam]\nwavelength_um = 0.85e-6": (
-        "beam.wavelength_um: must be a number from 0.2 to 30 [um], got 8.5e-07"
-    ),
+    "[beam]\nwavelength_um = 0.85e-6": ("beam.wavelength_um: must be a number from 0.2 to 30 [um], got 8.5e-07"),
     "[beam]\nwavelength_um = 850": "beam.wavelength_um: must be a number from 0.2 to 30 [um], got 850",
     "[curvature_sensor]\ndistances_km = [3.5e6]": (
         "curvature_sensor.distances_km[0]: must be a number from -1000000 to 1000000 [km], got 3500000.0"
     ),
     "[curvature_sensor]\ndistances_km = []": (
-        "curvature_sensor.distances_km: must be a list of 1 or more numbers from -1000000 to 1000000 [km], "
-        "got []"
+        "curvature_sensor.distances_km: must be a list of 1 or more numbers from -1000000 to 1000000 [km], got []"
     ),
     "[beam]\ndiameter_m = 8000": "beam.diameter_m: must be a number from 0.01 to 100 [m], got 8000",
     # rules between keys
@@ -105,13 +99,9 @@ UNKNOWN_KEYS = {
     "wavelenght_um = 0.65": "wavelenght_um: unknown key, got 0.65; did you mean beam.wavelength_um?",
     # in the wrong section
     "wavelength_um = 0.65": "wavelength_um: unknown key, got 0.65; did you mean beam.wavelength_um?",
-    "[atmosphere]\ndiameter_m = 8": (
-        "atmosphere.diameter_m: unknown key, got 8; did you mean beam.diameter_m?"
-    ),
+    "[atmosphere]\ndiameter_m = 8": ("atmosphere.diameter_m: unknown key, got 8; did you mean beam.diameter_m?"),
     # nothing like it
-    "[simulation]\nzzz = 1": (
-        "simulation.zzz: unknown key, got 1; known are frames, light_oversampling, light_window"
-    ),
+    "[simulation]\nzzz = 1": ("simulation.zzz: unknown key, got 1; known are frames, light_oversampling, light_window"),
     '[simulation]\n"two\\nlines" = 1': (
         'simulation."two\\nlines": unknown key, got 1; known are frames, light_oversampling, light_window'
     ),

@@ -28,9 +28,7 @@ def random_opd(shape: tuple[int, int], seed: int = 6) -> np.ndarray:
 def build(pupil=None, grid=None, *, distances_m=DISTANCES_M, spectrum=GREEN, dtype="float64", **options):
     pupil = asymmetric_pupil((20, 23)) if pupil is None else pupil
     grid = Grid((32, 35), 0.3) if grid is None else grid
-    return CurvatureSensor.build(
-        pupil, grid, distances_m=distances_m, spectrum=spectrum, dtype=dtype, **options
-    )
+    return CurvatureSensor.build(pupil, grid, distances_m=distances_m, spectrum=spectrum, dtype=dtype, **options)
 
 
 # ----------------------------------------------------------------------------------------------- refusals
@@ -109,9 +107,7 @@ def test_a_small_map_lies_in_the_middle_of_a_wide_grid(inner, outer):
 
 @pytest.mark.parametrize("outer", [(8, 10), (7, 9), (2, 10), (7, 2)])
 def test_a_map_that_cannot_share_its_centre_is_refused(outer):
-    with pytest.raises(
-        SettingsError, match=r"^grid\.shape: must exceed the pupil's \(3, 4\) by an even number"
-    ):
+    with pytest.raises(SettingsError, match=r"^grid\.shape: must exceed the pupil's \(3, 4\) by an even number"):
         centred_in(np.ones((3, 4)), outer)
 
 
@@ -155,9 +151,7 @@ def test_compiled_and_batched_images_are_the_same():
     sensor = build(spectrum=RAINBOW)
     opds_m = jnp.asarray(np.stack([random_opd((32, 35), seed) for seed in (1, 2, 3)]))
     photons = jnp.asarray([1.0, 2e4, 3e6])
-    one_by_one = np.stack(
-        [sensor.images(opd, rate).photons for opd, rate in zip(opds_m, photons, strict=True)]
-    )
+    one_by_one = np.stack([sensor.images(opd, rate).photons for opd, rate in zip(opds_m, photons, strict=True)])
     scale = np.asarray(photons)[:, None, None, None]
 
     compiled = jax.jit(lambda sensor, opd, rate: sensor.images(opd, rate).photons)
@@ -173,9 +167,9 @@ def test_planes_keep_their_order_and_their_share():
     fractions = np.array([0.1, 0.2, 0.3, 0.4])
     opd_m = jnp.asarray(random_opd((32, 35)))
     images = np.asarray(build(flux_fractions=tuple(fractions)).images(opd_m, 100.0).photons)
-    shuffled = build(
-        distances_m=tuple(DISTANCES_M[i] for i in order), flux_fractions=tuple(fractions[order])
-    ).images(opd_m, 100.0)
+    shuffled = build(distances_m=tuple(DISTANCES_M[i] for i in order), flux_fractions=tuple(fractions[order])).images(
+        opd_m, 100.0
+    )
     np.testing.assert_allclose(shuffled.photons, images[order], atol=1e-13)  # rounding of 100 photons
     assert shuffled.pixel_m == 0.3
     equal = np.asarray(build().images(opd_m, 100.0).photons)

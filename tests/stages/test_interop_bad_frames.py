@@ -245,9 +245,7 @@ def test_a_file_without_one_usable_frame_names_the_first(tmp_path):
 def test_a_background_that_is_already_subtracted_shows_as_negative_light(tmp_path):
     dim = np.random.default_rng(4).normal(0, 1.0, (PLANES, HEIGHT, WIDTH))
     write(tmp_path / "f.fits", dim, ("BACKGROUND", np.full((HEIGHT, WIDTH), 400.0)), RDNOISE=1.0)
-    assert refusal(tmp_path / "f.fits").startswith(
-        "PRIMARY: must not be negative beyond the noise of RDNOISE, DARK"
-    )
+    assert refusal(tmp_path / "f.fits").startswith("PRIMARY: must not be negative beyond the noise of RDNOISE, DARK")
 
 
 def with_nan(value):
@@ -329,10 +327,7 @@ def test_maps_in_another_unit_are_refused(tmp_path):
 def test_a_table_in_place_of_a_map_is_refused(tmp_path):
     table = fits.BinTableHDU.from_columns([fits.Column("a", "D", array=np.ones(4))], name="PUPIL")
     fits.HDUList([fits.PrimaryHDU(light(), fits.Header(GOOD)), table]).writeto(tmp_path / "f.fits")
-    assert (
-        refusal(tmp_path / "f.fits")
-        == "PUPIL: must be an image of 11 x 14 pixels, as the frames, got no image"
-    )
+    assert refusal(tmp_path / "f.fits") == "PUPIL: must be an image of 11 x 14 pixels, as the frames, got no image"
 
 
 def test_no_file_a_folder_and_files_that_are_not_fits(tmp_path):

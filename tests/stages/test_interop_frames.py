@@ -87,9 +87,7 @@ def test_a_hand_written_file_is_read_the_right_way_up(tmp_path):
 def test_adu_become_electrons_and_so_does_their_background(tmp_path):
     image = light(2, PLANES, HEIGHT, WIDTH).astype(np.uint16)
     background = np.full((HEIGHT, WIDTH), 1.5)
-    path = write(
-        tmp_path / "f.fits", image, ("BACKGROUND", background), BUNIT="ADU", GAIN=2.5, RDNOISE=1.5, DARK=0.25
-    )
+    path = write(tmp_path / "f.fits", image, ("BACKGROUND", background), BUNIT="ADU", GAIN=2.5, RDNOISE=1.5, DARK=0.25)
     frames = read_frames(path)
     np.testing.assert_array_equal(frames.electrons, image * 2.5)
     np.testing.assert_array_equal(frames.background, background * 2.5)
@@ -241,9 +239,7 @@ def test_a_flat_top_without_saturate_is_told(tmp_path):
     image = np.minimum(light() * np.linspace(0.2, 2.0, WIDTH), 70.0)
     warning = read_frames(write(tmp_path / "f.fits", image)).warnings
     count = np.count_nonzero(image == 70.0)
-    assert warning == (
-        f"PRIMARY: {count} pixels share the largest value of their frame: saturated? Give SATURATE",
-    )
+    assert warning == (f"PRIMARY: {count} pixels share the largest value of their frame: saturated? Give SATURATE",)
 
 
 def test_read_noise_may_make_dark_pixels_negative(tmp_path):

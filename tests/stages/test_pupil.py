@@ -25,9 +25,7 @@ def test_an_obstructed_circle_has_the_area_of_a_ring(pixels):
 def test_a_vane_takes_its_length_times_its_width(angle_deg, width_m):
     grid = Grid((49, 52), 8 / 45)
     clear = circular_pupil(grid, diameter_m=8.0, obstruction_ratio=0.3)
-    crossed = circular_pupil(
-        grid, diameter_m=8.0, obstruction_ratio=0.3, spiders=Spiders((angle_deg,), width_m)
-    )
+    crossed = circular_pupil(grid, diameter_m=8.0, obstruction_ratio=0.3, spiders=Spiders((angle_deg,), width_m))
     taken_m2 = lit_area_m2(clear, grid) - lit_area_m2(crossed, grid)
     # 1.5 %: the round ends of the strip and parts of pixels at an angle.
     assert taken_m2 == pytest.approx(width_m * 4 * (1 - 0.3), rel=0.015)
@@ -37,9 +35,7 @@ def test_a_single_vane_lies_where_its_angle_says():
     grid = Grid((40, 41), 0.2)
     spiders = Spiders((60.0,), 0.3)
     clear = circular_pupil(grid, diameter_m=8.0)
-    dark = (clear - circular_pupil(grid, diameter_m=8.0, spiders=spiders)) * (
-        np.hypot(grid.y_m, grid.x_m) < 3.8
-    )
+    dark = (clear - circular_pupil(grid, diameter_m=8.0, spiders=spiders)) * (np.hypot(grid.y_m, grid.x_m) < 3.8)
     # Centroid of a strip from 0 to 3.8 m at 60 degrees from +x towards +y; 0.05 m is a quarter pixel.
     assert (dark * grid.x_m).sum() / dark.sum() == pytest.approx(1.9 * 0.5, abs=0.05)
     assert (dark * grid.y_m).sum() / dark.sum() == pytest.approx(1.9 * np.sqrt(3) / 2, abs=0.05)

@@ -124,9 +124,7 @@ def test_planes_must_be_somewhere(distances_m):
         sampling_needed(LIGHT, distances_m)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"diameter_m": 0.0}, {"wavelength_m": -1.0}, {"fried_m": 0.0}, {"rms_rad": -0.1}]
-)
+@pytest.mark.parametrize("wrong", [{"diameter_m": 0.0}, {"wavelength_m": -1.0}, {"fried_m": 0.0}, {"rms_rad": -0.1}])
 def test_impossible_light_is_refused(wrong):
     (key,) = wrong
     with pytest.raises(SamplingError, match=rf"light\.{key}: must be"):

@@ -10,9 +10,7 @@ from nlcwfs.beam.zernike import nm_to_noll, noll_to_nm, zernike, zernike_fit, ze
 from nlcwfs.errors import SamplingError, SettingsError
 
 GRID = Grid((50, 57), 0.2)
-PUPIL = circular_pupil(
-    GRID, diameter_m=8.0, obstruction_ratio=0.3, spiders=Spiders((10.0, 100.0, 215.0), 0.2)
-)
+PUPIL = circular_pupil(GRID, diameter_m=8.0, obstruction_ratio=0.3, spiders=Spiders((10.0, 100.0, 215.0), 0.2))
 
 
 def closed_forms(grid, radius_m):

@@ -71,9 +71,7 @@ class Turbulence:
     def opd_spectrum(self, frequency_per_m: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Power spectrum of the OPD in m^2 per (cycle/m)^2 (Noll 1976, eq. 21, in OPD)."""
         squared = np.asarray(frequency_per_m) ** 2 + self.outer_scale_m**-2
-        return (
-            0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
-        )
+        return 0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
 
 
 class PhaseScreens(eqx.Module):
@@ -113,9 +111,7 @@ class PhaseScreens(eqx.Module):
         step_per_m = 1 / (period * pixel_m)
         frequency = np.fft.fftfreq(period, pixel_m)
         radius = np.hypot(frequency[:, None], frequency[None, :])
-        central = (np.abs(frequency[:, None]) < 1.5 * step_per_m) & (
-            np.abs(frequency[None, :]) < 1.5 * step_per_m
-        )
+        central = (np.abs(frequency[:, None]) < 1.5 * step_per_m) & (np.abs(frequency[None, :]) < 1.5 * step_per_m)
         radius = np.maximum(radius, step_per_m)
         # The mean of f^2 f^(-11/3) over a cell, to second order: as below, each wave has its cell's mean slope.
         power = turbulence.opd_spectrum(radius) * (1 + (5 / 3) ** 2 / 24 * (step_per_m / radius) ** 2)

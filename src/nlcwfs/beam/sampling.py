@@ -168,9 +168,7 @@ def check_sampling(
 
 def _refuse_impossible(light: SensedLight, need: SamplingNeed, pixel_m: float, window_m: float) -> None:
     if not (pixel_m > 0 and light.diameter_m / pixel_m >= FEWEST_PIXELS_ACROSS):
-        rule = (
-            f"must be positive and put at least {FEWEST_PIXELS_ACROSS} pixels across {light.diameter_m:g} m"
-        )
+        rule = f"must be positive and put at least {FEWEST_PIXELS_ACROSS} pixels across {light.diameter_m:g} m"
         raise SamplingError("sampling.pixel_m", rule, pixel_m)
     if not (light.diameter_m * (1 - 1e-9) <= window_m < np.inf):
         rule = f"must hold at least the pupil of {light.diameter_m:g} m"

@@ -21,9 +21,7 @@ class BeamSettings(BaseModel):
     obstruction_ratio: float = Field(
         default=0.0, ge=0, lt=1, description="Diameter of the central obstruction over that of the telescope."
     )
-    spider_count: int = Field(
-        default=0, ge=0, le=64, description="Number of vanes that hold the secondary mirror."
-    )
+    spider_count: int = Field(default=0, ge=0, le=64, description="Number of vanes that hold the secondary mirror.")
     spider_width_m: float = Field(
         default=0.05, gt=0, allow_inf_nan=False, description="Width of a vane; unused without vanes."
     )
@@ -38,9 +36,7 @@ class BeamSettings(BaseModel):
         examples=["pupil.fits"],
         description="FITS image of the pupil's amplitude, 0 to 1; replaces circle, obstruction and vanes.",
     )
-    wavelength_um: float = Field(
-        default=0.85, ge=0.2, le=30, description="Wavelength at which the sensor works."
-    )
+    wavelength_um: float = Field(default=0.85, ge=0.2, le=30, description="Wavelength at which the sensor works.")
 
     @model_validator(mode="after")
     def _vanes_fit(self) -> "BeamSettings":

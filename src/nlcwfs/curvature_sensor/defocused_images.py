@@ -94,13 +94,9 @@ class CurvatureSensor(eqx.Module):
             raise SettingsError("curvature_sensor.distances_m", "must be finite, at least one", distances)
         fractions = np.full(len(distances), 1 / len(distances)) if flux_fractions is None else flux_fractions
         fractions = np.asarray(fractions, float)
-        shared = (
-            fractions.shape == (len(distances),) and fractions.min() > 0 and abs(fractions.sum() - 1) <= 1e-6
-        )
+        shared = fractions.shape == (len(distances),) and fractions.min() > 0 and abs(fractions.sum() - 1) <= 1e-6
         if not shared:  # NaN included
-            raise SettingsError(
-                "curvature_sensor.flux_fractions", "must be one per plane, positive, sum 1", fractions
-            )
+            raise SettingsError("curvature_sensor.flux_fractions", "must be one per plane, positive, sum 1", fractions)
         if not np.all(np.isfinite(pupil)):
             bad = np.size(pupil) - np.isfinite(pupil).sum()
             raise SettingsError("pupil", "must be finite", f"{bad} pixels that are not")
@@ -153,7 +149,5 @@ def centred_in(array: Float[np.ndarray, "py px"], shape: tuple[int, int]) -> Flo
     inner = np.shape(array)
     margins = [outer - size for outer, size in zip(shape, inner, strict=True)]
     if min(margins) < 0 or any(margin % 2 for margin in margins):
-        raise SettingsError(
-            "grid.shape", f"must exceed the pupil's {inner} by an even number of pixels", tuple(shape)
-        )
+        raise SettingsError("grid.shape", f"must exceed the pupil's {inner} by an even number of pixels", tuple(shape))
     return np.pad(np.asarray(array, float), [(margin // 2, margin // 2) for margin in margins])

@@ -13,8 +13,7 @@ class CurvatureSensorSettings(BaseModel):
     distances_km: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
         default=(-3500.0, -2500.0, 2500.0, 3500.0),
         min_length=1,
-        description="where the planes lie, at the scale of the telescope; positive is downstream of the "
-        "pupil",
+        description="where the planes lie, at the scale of the telescope; positive is downstream of the pupil",
     )
     flux_fractions: tuple[float, ...] | None = Field(
         default=None,
@@ -24,18 +23,14 @@ class CurvatureSensorSettings(BaseModel):
     static_rms_nm: float = Field(
         default=0.0, ge=0, description="rms of a known static Kolmogorov aberration in the arm of the sensor"
     )
-    static_seed: int = Field(
-        default=0, ge=0, description="which static aberration; the same number is the same shape"
-    )
+    static_seed: int = Field(default=0, ge=0, description="which static aberration; the same number is the same shape")
 
     @model_validator(mode="after")
     def _planes_agree(self) -> "CurvatureSensorSettings":
         if len(set(self.distances_km)) < len(self.distances_km):
             raise ValueError("distances_km must differ from each other")
         if all(distance == 0 for distance in self.distances_km):
-            raise ValueError(
-                "distances_km must hold a plane out of the pupil: one at 0 does not see the phase"
-            )
+            raise ValueError("distances_km must hold a plane out of the pupil: one at 0 does not see the phase")
         if self.flux_fractions is None:
             return self
         if len(self.flux_fractions) != len(self.distances_km):

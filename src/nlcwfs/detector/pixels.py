@@ -71,8 +71,7 @@ def fraction_outside_window(
     """
     _check_geometry("fraction_outside_window", factor, window)
     inside_y, inside_x = (
-        _fraction_inside(size, count * factor)
-        for size, count in zip(photon_rate.shape[1:], window, strict=True)
+        _fraction_inside(size, count * factor) for size, count in zip(photon_rate.shape[1:], window, strict=True)
     )
     outside = jnp.asarray(1 - inside_y[:, None] * inside_x[None, :], photon_rate.dtype)
     lost = jnp.sum(photon_rate * outside[None], axis=(1, 2))

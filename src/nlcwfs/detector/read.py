@@ -86,9 +86,7 @@ class Detector(eqx.Module):
     @property
     def background_electrons(self) -> float:
         """Mean electrons of a pixel without starlight; subtract them to see the star alone."""
-        return (
-            self.settings.quantum_efficiency * self.settings.background_photons + self.settings.dark_electrons
-        )
+        return self.settings.quantum_efficiency * self.settings.background_photons + self.settings.dark_electrons
 
     def variance_electrons(self, mean_electrons: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Variance of `Frames.electrons` without saturation: an estimator's model of the noise.

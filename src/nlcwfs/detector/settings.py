@@ -28,63 +28,63 @@ class DetectorSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: Literal["ideal", "qCMOS", "EMCCD", "custom"] = Field(
-        "ideal",
+        default="ideal",
         description="Fills every key below that is not set, except the pixels: ideal (photon noise only), "
         "qCMOS (Hamamatsu ORCA-Quest), EMCCD (OCAM2K), custom (starts from ideal).",
     )
     pixels_across_pupil: int = Field(
-        90, ge=2, le=8192, description="Detector pixels across the diameter of the pupil."
+        default=90, ge=2, le=8192, description="Detector pixels across the diameter of the pupil."
     )
     window_pixels: int = Field(
-        128, ge=2, le=8192, description="Detector pixels along a side of the square window around each image."
+        default=128, ge=2, le=8192, description="Detector pixels along a side of the square window around each image."
     )
     quantum_efficiency: float = Field(
-        IDEAL["quantum_efficiency"], gt=0, le=1, description="Electrons per photon at the sensing wavelength."
+        default=IDEAL["quantum_efficiency"], gt=0, le=1, description="Electrons per photon at the sensing wavelength."
     )
     background_photons: float = Field(
-        IDEAL["background_photons"],
+        default=IDEAL["background_photons"],
         ge=0,
         allow_inf_nan=False,
         description="Photons of the sky on each pixel in one exposure.",
     )
     dark_electrons: float = Field(
-        IDEAL["dark_electrons"],
+        default=IDEAL["dark_electrons"],
         ge=0,
         allow_inf_nan=False,
         description="Electrons that appear without light in each pixel in one exposure.",
     )
     read_noise_electrons: float = Field(
-        IDEAL["read_noise_electrons"],
+        default=IDEAL["read_noise_electrons"],
         ge=0,
         allow_inf_nan=False,
         description="Rms noise of the amplifier, in electrons behind the multiplication register.",
     )
     em_gain: float = Field(
-        IDEAL["em_gain"],
+        default=IDEAL["em_gain"],
         ge=1,
         allow_inf_nan=False,
         description="Mean multiplication of an electron before the amplifier; 1 = none. Above 1 it adds the "
         "excess noise of the register, variance times 2 - 1/em_gain.",
     )
     gain_electrons_per_adu: float = Field(
-        IDEAL["gain_electrons_per_adu"],
+        default=IDEAL["gain_electrons_per_adu"],
         gt=0,
         allow_inf_nan=False,
         description="Electrons behind the multiplication register per step of the converter.",
     )
     full_well_electrons: float = Field(
-        IDEAL["full_well_electrons"],
+        default=IDEAL["full_well_electrons"],
         gt=0,
         description="Most electrons that a pixel holds, before multiplication; inf = no limit.",
     )
     bits: int = Field(
-        IDEAL["bits"],
+        default=IDEAL["bits"],
         ge=0,
         le=20,  # beyond, float32 no longer returns a code through electrons and back
         description="Bits of the analogue-to-digital converter; 0 = neither rounding nor an upper limit.",
     )
     bias_adu: float = Field(
-        IDEAL["bias_adu"],
+        default=IDEAL["bias_adu"],
         ge=0,
         allow_inf_nan=False,
         description="Reading of a pixel without a single electron.",

@@ -8,6 +8,9 @@ from jaxtyping import Array, Bool, Float
 LARGEST_FACTOR = 3.0
 """A pixel on which the model has no light cannot ask for more than this in one step."""
 
+DARK_SHARE = 0.2
+"""Share of the mean count that counts as model light where the model is dark."""
+
 FLOOR = 0.1
 """Share of the mean count added to the variance, so that dark pixels do not rule the step."""
 
@@ -19,6 +22,7 @@ def modulus_factor(
     *,
     method: Literal["poisson", "replace"],
     read_variance: float | Float[Array, ""] = 0.0,
+    doubt: float = 0.0,
 ) -> Float[Array, "plane y x"]:
     r"""By how much to multiply the model's light on each pixel.
 
@@ -34,6 +38,8 @@ def modulus_factor(
         usable: False where a pixel is masked or was not on the detector: the model's light passes.
         method: See above.
         read_variance: Variance of a pixel without light, in electrons squared.
+        doubt: Relative variance of the model itself, while its phase is still coarse: bright speckles then
+            weigh no more than faint ones. The step keeps its mean length, see `doubt_factor`.
 
     Examples:
         >>> import jax.numpy as jnp
@@ -45,13 +51,21 @@ def modulus_factor(
     if method == "replace":
         tiny = jnp.finfo(counts.dtype).tiny
         factor = jnp.sqrt(jnp.maximum(counts, 0) / jnp.maximum(model, tiny))
-        # Dark speckles of the model would otherwise be multiplied by millions.
         return jnp.where(usable & (model > tiny), factor, 1)
-    seen = jnp.where(usable, counts, 0)
-    mean = jnp.sum(seen, axis=(1, 2), keepdims=True) / jnp.maximum(
-        jnp.sum(usable.astype(counts.dtype), axis=(1, 2), keepdims=True), 1
-    )
-    variance = (jnp.maximum(counts, 0) + model) / 2 + FLOOR * jnp.maximum(mean, 0) + read_variance
-    variance = jnp.maximum(variance, jnp.finfo(counts.dtype).tiny)
-    factor = jnp.clip(1 + (counts - model) / (2 * variance), 0, LARGEST_FACTOR)
-    return jnp.where(usable, factor, 1)
+    mean = mean_count(counts, usable)
+    variance = (jnp.maximum(counts, 0) + model) / 2 + FLOOR * mean + read_variance
+    variance = variance + doubt * (model + DARK_SHARE * mean) ** 2
+    step = doubt_factor(mean, doubt) * (counts - model) / (2 * variance)
+    return jnp.where(usable, jnp.clip(1 + step, 0, LARGEST_FACTOR), 1)
+
+
+def mean_count(counts: Float[Array, "plane y x"], usable: Bool[Array, "plane y x"]) -> Float[Array, "plane 1 1"]:
+    """Mean of the usable pixels of each plane; tiny instead of nothing, because it divides."""
+    total = jnp.sum(jnp.where(usable, counts, 0), axis=(1, 2), keepdims=True)
+    number = jnp.sum(usable.astype(counts.dtype), axis=(1, 2), keepdims=True)
+    return jnp.maximum(total / jnp.maximum(number, 1), jnp.finfo(counts.dtype).tiny)
+
+
+def doubt_factor(mean: Float[Array, "plane 1 1"], doubt: float) -> Float[Array, "plane 1 1"]:
+    """By how much doubt lengthens the variance of a pixel of mean light, hence the step and the phase noise."""
+    return 1 + doubt * (1 + DARK_SHARE) ** 2 * mean

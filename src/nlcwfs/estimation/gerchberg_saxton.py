@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from nlcwfs.estimation.amplitude_constraint import modulus_factor
+from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, modulus_factor
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
+from nlcwfs.estimation.speckle_blur import blurred
 from nlcwfs.estimation.turbulence_filter import smooth_like_turbulence
 
 
@@ -37,15 +38,19 @@ class Problem(NamedTuple):
         level: The sensor.
         measurement: The counts.
         reference_rad: Phase that is added and never smoothed: starting tilt and static aberration.
-        power: The filter of the present cutoff.
-        strength: Variance of the turbulence over that behind `power`.
+        power: Expected power of the phase up to the present cutoff, see `turbulence_filter`.
+        noise: Variance of the phase of a fully lit pixel after a step, rad^2, for the filter.
+        gain: Length of a step.
+        blur: Fourier factor of the model's images, for the turbulence that is not modelled yet; None for none.
     """
 
     level: Level
     measurement: Measurement
     reference_rad: Float[Array, "y x"]
     power: Float[Array, "y fx"]
-    strength: Float[Array, ""]
+    noise: Float[Array, ""]
+    gain: Float[Array, ""]
+    blur: Float[Array, "plane v fu"] | None
 
 
 def init(phase_rad: Float[Array, "y x"]) -> GerchbergSaxtonState:
@@ -54,9 +59,7 @@ def init(phase_rad: Float[Array, "y x"]) -> GerchbergSaxtonState:
     return GerchbergSaxtonState(phase_rad, phase_rad, far, jnp.asarray(0, jnp.int32))
 
 
-def step(
-    problem: Problem, settings: GerchbergSaxtonSettings, state: GerchbergSaxtonState
-) -> GerchbergSaxtonState:
+def step(problem: Problem, settings: GerchbergSaxtonSettings, state: GerchbergSaxtonState) -> GerchbergSaxtonState:
     """One Gerchberg-Saxton iteration over all planes.
 
     Fast-forward: the iteration starts ahead of the phase, along its last step. Then, for all planes at once
@@ -64,7 +67,7 @@ def step(
     back; the pupil's modulus is put back by keeping the phase only.
     """
     planes = problem.measurement.counts.shape[0]
-    phase_rad = state.phase_rad + settings.fast_forward * (state.phase_rad - state.previous_rad)
+    phase_rad = state.phase_rad + problem.level.fast_forward * (state.phase_rad - state.previous_rad)
     if settings.scheme == "averaged":
         phase_rad = _through_planes(problem, settings, phase_rad, jnp.arange(planes))
     else:
@@ -110,17 +113,11 @@ def _through_planes(
     planes: Int[Array, " p"],
 ) -> Float[Array, "y x"]:
     """To some planes and back: the phase after the measured moduli have been imposed there."""
-    level, measurement = problem.level, problem.measurement
+    level = problem.level
     near = pupil_light(level, phase_rad + problem.reference_rad)
     transfer = level.optics.transfer[0][planes]
     far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * transfer)
-    factor = modulus_factor(
-        measurement.counts[planes],
-        modelled_counts(level, measurement, far, planes),
-        measurement.usable[planes],
-        method=settings.amplitude,
-        read_variance=measurement.read_variance,
-    )
+    factor = _factor_on_pixels(problem, settings, far, planes)
     share = level.optics.flux_fractions[planes]
     spectra = jnp.fft.fft2(far * level.on_cells(factor).astype(far.dtype)) * jnp.conj(transfer)
     spectrum = jnp.sum(spectra * (share / jnp.sum(share))[:, None, None].astype(far.dtype), axis=0)
@@ -128,36 +125,58 @@ def _through_planes(
         spectrum = spectrum * level.low_pass.astype(far.dtype)
     returned = jnp.fft.ifft2(spectrum)
     turned_rad = jnp.angle(returned * jnp.conj(near)) * level.light
-    phase_rad = phase_rad + level.gain * turned_rad
+    phase_rad = phase_rad + problem.gain * turned_rad
     if settings.filter != "turbulence":
         return phase_rad
-    return smooth_like_turbulence(
-        phase_rad, problem.power * problem.strength, level.gain * phase_noise(level, measurement)
+    return smooth_like_turbulence(phase_rad, problem.power, problem.noise)
+
+
+def _factor_on_pixels(
+    problem: Problem,
+    settings: GerchbergSaxtonSettings,
+    far: Complex[Array, "p y x"],
+    planes: Int[Array, " p"],
+) -> Float[Array, "p v u"]:
+    """By how much to multiply the light on the measured pixels."""
+    level, measurement = problem.level, problem.measurement
+    model = modelled_counts(level, measurement, far, planes)
+    if problem.blur is not None:
+        model = blurred(model, problem.blur[planes])
+    factor = modulus_factor(
+        measurement.counts[planes],
+        model,
+        measurement.usable[planes],
+        method=settings.amplitude,
+        read_variance=measurement.read_variance,
+        doubt=level.doubt,
     )
+    if problem.blur is None:
+        return factor
+    return 1 + blurred(factor - 1, problem.blur[planes])
 
 
 def phase_noise(level: Level, measurement: Measurement) -> Float[Array, ""]:
     """Variance of the phase that photon noise allows in a fully lit pixel: 1 / (4 photons), rad^2."""
     total = jnp.sum(jnp.where(measurement.usable, measurement.counts, 0))
     photons = jnp.maximum(total, 1) / jnp.sum(level.light)
-    return 1 / (4 * photons)
+    mean = jnp.mean(mean_count(measurement.counts, measurement.usable), keepdims=True)
+    return jnp.squeeze(doubt_factor(mean, level.doubt)) / (4 * photons)
 
 
-def ffts_per_iteration(planes: int, settings: GerchbergSaxtonSettings) -> int:
-    """Two-dimensional FFTs of one iteration, those of the filter included.
+def ffts_per_iteration(planes: int, settings: GerchbergSaxtonSettings, *, blurs: bool) -> int:
+    """Two-dimensional complex FFTs of one iteration; two real ones (filter, blur) count as one.
 
     Examples:
-        >>> ffts_per_iteration(4, GerchbergSaxtonSettings(filter="none"))
+        >>> ffts_per_iteration(4, GerchbergSaxtonSettings(filter="none"), blurs=False)
         10
     """
-    filtering = 2 if settings.filter == "turbulence" else 0
+    filtering = 1 if settings.filter == "turbulence" else 0
+    blurring = 2 * planes if blurs else 0
     if settings.scheme == "averaged":
-        return 2 * planes + 2 + filtering
-    return planes * (4 + filtering)
+        return 2 * planes + 2 + filtering + blurring
+    return planes * (4 + filtering) + blurring
 
 
-def low_pass_factor(
-    frequency_per_m: Float[np.ndarray, "y x"], *, cutoff_per_m: float
-) -> Float[np.ndarray, "y x"]:
+def low_pass_factor(frequency_per_m: Float[np.ndarray, "y x"], *, cutoff_per_m: float) -> Float[np.ndarray, "y x"]:
     """The paper's filtering inside the loop, as a smooth cut of the returning light."""
     return np.exp(-((frequency_per_m / cutoff_per_m) ** 4))

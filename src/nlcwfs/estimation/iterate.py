@@ -9,9 +9,7 @@ from jaxtyping import Array
 State = TypeVar("State")
 
 
-def iterate(
-    step: Callable[[State], State], terminate: Callable[[State], Array], state: State
-) -> State:
+def iterate(step: Callable[[State], State], terminate: Callable[[State], Array], state: State) -> State:
     """Repeat a step until the method says that it is done.
 
     Examples:

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from nlcwfs.beam.grid import Grid
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
+from nlcwfs.estimation.speckle_blur import blurred
 
 
 class Measurement(eqx.Module):
@@ -28,14 +30,10 @@ class Measurement(eqx.Module):
             ((outer - inner) // 2, (outer - inner) // 2)
             for outer, inner in zip(shape, self.counts.shape[1:], strict=True)
         ]
-        return Measurement(
-            jnp.pad(self.counts, margins), jnp.pad(self.usable, margins), self.read_variance
-        )
+        return Measurement(jnp.pad(self.counts, margins), jnp.pad(self.usable, margins), self.read_variance)
 
     def binned(self, factor: int) -> "Measurement":
         """Counts summed over squares of pixels; a masked pixel counts as the mean of its usable neighbours."""
-        if factor == 1:
-            return self
         known = self.usable.astype(self.counts.dtype)
         around = _sum_of_neighbours(self.counts * known)
         number = _sum_of_neighbours(known)
@@ -46,6 +44,11 @@ class Measurement(eqx.Module):
             self.read_variance * factor**2,
         )
 
+    def smoothed(self, factor: Float[Array, "y fx"]) -> "Measurement":
+        """Counts with each wave multiplied by a factor; masked ones should be filled (`binned`)."""
+        smooth = blurred(self.counts, jnp.broadcast_to(factor, (self.counts.shape[0], *factor.shape)))
+        return Measurement(smooth, self.usable, self.read_variance)
+
 
 class Level(eqx.Module):
     """The sensor at one resolution, with what its iterations need.
@@ -54,23 +57,41 @@ class Level(eqx.Module):
         optics: The sensor on the grid of the model.
         light: Light of each pixel over that of a fully lit one.
         power: Expected power of the phase, one filter for each cutoff.
+        structures: For each cutoff, plane and wave of the images, the structure function of the phase beyond the
+            cutoff (rad^2, see `speckle_blur`); None where everything is modelled.
+        beyond: For each cutoff, variance of the phase beyond it, rad^2.
+        smoothing: Fourier factor that smooths counts and model alike; None for none.
+        doubt: Relative variance of the model's intensity, see `modulus_factor`.
         low_pass: Factor on the spectrum of the returning light.
+        grid: Cells of the model.
         binning: Detector pixels per measured pixel of this level, along an axis.
         oversampling: Cells of the model per measured pixel of this level, along an axis.
         iterations: Most iterations for each cutoff.
         gain: Length of a step.
+        fast_forward: Share of the last step that is added ahead of the next one.
         tolerance_rad: An iteration that moves less ends the level.
     """
 
     optics: CurvatureSensor
     light: Float[Array, "y x"]
     power: Float[Array, "cutoff y fx"]
+    structures: Float[Array, "cutoff plane v fu"] | None
+    beyond: Float[Array, " cutoff"]
+    smoothing: Float[Array, "v fu"] | None
     low_pass: Float[Array, "y x"]
+    grid: Grid = eqx.field(static=True)
     binning: int = eqx.field(static=True)
     oversampling: int = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     gain: float = eqx.field(static=True)
+    fast_forward: float = eqx.field(static=True)
+    doubt: float = eqx.field(static=True)
     tolerance_rad: float = eqx.field(static=True)
+
+    @property
+    def measured_shape(self) -> tuple[int, int]:
+        """Measured pixels along y and x, the unmeasured rim included."""
+        return self.grid.shape[0] // self.oversampling, self.grid.shape[1] // self.oversampling
 
     def on_pixels(self, photons: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
         """What the measured pixels see of light on the model's grid."""
@@ -91,11 +112,21 @@ def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "p
     return array.reshape(planes, rows // factor, factor, columns // factor, factor).sum(axis=(2, 4))
 
 
-def resample_phase(phase_rad: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:
-    """The same smooth phase over the same window, on another number of pixels."""
+def resample_phase(phase_rad: Float[Array, "y x"], shape: tuple[int, int], *, wrapped: bool) -> Float[Array, "v u"]:
+    """The same phase over the same window, on another number of pixels.
+
+    Args:
+        phase_rad: The phase.
+        shape: Pixels wanted.
+        wrapped: Whether the phase may jump by whole turns; then its unit phasor is resampled.
+    """
     if phase_rad.shape == shape:
         return phase_rad
-    return jax.image.resize(phase_rad, shape, method="cubic").astype(phase_rad.dtype)
+    if not wrapped:
+        return jax.image.resize(phase_rad, shape, method="cubic").astype(phase_rad.dtype)
+    cosine = jax.image.resize(jnp.cos(phase_rad), shape, method="linear")
+    sine = jax.image.resize(jnp.sin(phase_rad), shape, method="linear")
+    return jnp.arctan2(sine, cosine).astype(phase_rad.dtype)
 
 
 def lit_fraction(pupil: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:

@@ -33,13 +33,23 @@ class GerchbergSaxtonSettings(BaseModel):
     )
     low_pass_cpa: float = Field(default=14.0, gt=0, description="cut of the low-pass filter, cycles per aperture")
     coarse_cutoffs_cpa: tuple[float, ...] = Field(
-        default=(3.0, 4.0, 6.0, 9.0, 12.0, 16.0),
+        default=(2.0, 3.0, 4.0, 6.0, 8.0, 12.0),
         description="coarse to fine: finest wave of the phase, cycles per aperture, level by level; [] = none",
     )
-    coarse_iterations: int = Field(default=10, ge=1, le=10000, description="iterations of each coarse level")
-    coarse_gain: float = Field(default=3.0, gt=0, le=10, description="length of a step on the coarse levels")
+    coarse_iterations: int = Field(default=8, ge=1, le=10000, description="iterations of each coarse level")
+    coarse_gain: float = Field(default=6.0, gt=0, le=100, description="length of a step on the coarse levels")
+    coarse_fast_forward: float = Field(default=0.85, ge=0, lt=1, description="fast-forward of the coarse levels")
+    coarse_doubt: float = Field(
+        default=0.2, ge=0, le=10, description="relative variance of the model's light on the coarse levels"
+    )
+    smoothing_pixels: float = Field(
+        default=1.0,
+        ge=0,
+        le=10,
+        description="Gaussian that smooths the images on the coarse levels, detector pixels",
+    )
     binning: int = Field(
-        default=2, ge=1, le=8, description="pixels binned on the levels that need no finer ones; 1 = never"
+        default=1, ge=1, le=8, description="pixels binned on the levels that need no finer ones; 1 = never"
     )
     iterations: int = Field(default=20, ge=1, le=100000, description="most iterations at full resolution")
     gain: float = Field(default=1.5, gt=0, le=10, description="length of a step; 1 is Gerchberg and Saxton's")
@@ -47,10 +57,15 @@ class GerchbergSaxtonSettings(BaseModel):
         default=0.7, ge=0, lt=1, description="share of the last step added ahead of the next one; 0 = none"
     )
     tolerance_rad: float = Field(
-        default=0.01, ge=0, description="stop when an iteration moves the phase by less than this rms; 0 = never"
+        default=0.01,
+        ge=0,
+        description="stop when an iteration moves the phase by less than this rms; 0 = never",
     )
     oversampling: int = Field(
-        default=1, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
+        default=1,
+        ge=1,
+        le=8,
+        description="cells of the model per detector pixel along an axis; costs its square",
     )
 
 
@@ -61,7 +76,10 @@ class EstimationSettings(BaseModel):
 
     method: Literal["gerchberg-saxton"] = Field(default="gerchberg-saxton", description="the reconstructor")
     modes: int = Field(
-        default=800, ge=1, le=20000, description="modes for unwrapping, and Zernikes listed in the result (at most 800)"
+        default=800,
+        ge=1,
+        le=20000,
+        description="modes for unwrapping, and Zernikes listed in the result (at most 800)",
     )
     unwrapping: Literal["carried", "slopes"] = Field(
         default="carried",

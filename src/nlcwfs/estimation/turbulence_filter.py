@@ -58,3 +58,22 @@ def smooth_like_turbulence(
     kept = power / (power + noise_variance)
     filtered = jnp.fft.irfft2(spectrum * kept.astype(spectrum.dtype), s=phase_rad.shape)
     return filtered.astype(phase_rad.dtype)
+
+
+def expected_error(power: Float[Array, "y fx"], noise_variance: Float[Array, ""], grid: Grid) -> Float[Array, ""]:
+    """Rms phase error that is left by noise and smoothing: each wave keeps `power * noise / (power + noise)`.
+
+    Piston and, because a pupil shows them as little else, waves longer than two windows are not counted.
+
+    Args:
+        power: See `expected_power`.
+        noise_variance: Variance of white phase noise per pixel, rad^2.
+        grid: Pixels of the phase.
+    """
+    rows, columns = grid.shape
+    twice = np.full(columns // 2 + 1, 2.0)
+    twice[0] = 1.0
+    if columns % 2 == 0:
+        twice[-1] = 1.0
+    left = power * noise_variance / (power + noise_variance) * jnp.asarray(twice[None, :], power.dtype)
+    return jnp.sqrt((jnp.sum(left) - left[0, 0]) / (rows * columns))

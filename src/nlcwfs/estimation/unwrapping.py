@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.modes import ModalBasis
 
@@ -22,6 +22,9 @@ class SlopeUnwrapper(eqx.Module):
     Attributes:
         modes: On the lit pixels, one row each.
         weights: Share of the light of each lit pixel, sum 1.
+        lit: Rows and columns of the lit pixels.
+        first: One lit pixel of each pair of neighbours.
+        second: The other.
         from_slopes: Coefficients for one radian of difference on each pair of neighbours.
         passes: How often the remainder is projected back.
     """
@@ -29,9 +32,9 @@ class SlopeUnwrapper(eqx.Module):
     modes: Float[Array, "mode lit"]
     weights: Float[Array, " lit"]
     from_slopes: Float[Array, "mode pair"]
-    lit: tuple[np.ndarray, np.ndarray] = eqx.field(static=False)
-    first: np.ndarray
-    second: np.ndarray
+    lit: tuple[Int[Array, " lit"], Int[Array, " lit"]]
+    first: Int[Array, " pair"]
+    second: Int[Array, " pair"]
     passes: int = eqx.field(static=True)
 
     @classmethod
@@ -74,9 +77,9 @@ class SlopeUnwrapper(eqx.Module):
             modes=jnp.asarray(modes, dtype),
             weights=jnp.asarray(lit_weights, dtype),
             from_slopes=jnp.asarray(from_slopes, dtype),
-            lit=(rows, columns),
-            first=first,
-            second=second,
+            lit=(jnp.asarray(rows), jnp.asarray(columns)),
+            first=jnp.asarray(first),
+            second=jnp.asarray(second),
             passes=passes,
         )
 
@@ -96,6 +99,11 @@ class SlopeUnwrapper(eqx.Module):
             remainder = wrap(remainder - jnp.arctan2(imaginary, real))
             found = found + self.modes @ (self.weights * remainder)
         return found
+
+    def unwrapped(self, wrapped_rad: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        """The unwrapped phase, as a sum of modes; zero outside the pupil."""
+        lit_rad = self.coefficients(wrapped_rad) @ self.modes
+        return jnp.zeros_like(wrapped_rad).at[self.lit[0], self.lit[1]].set(lit_rad.astype(wrapped_rad.dtype))
 
 
 def wrap(phase_rad: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

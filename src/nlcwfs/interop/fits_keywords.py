@@ -206,6 +206,4 @@ def compact(array: np.ndarray) -> np.ndarray:
     """The array as float32 where that loses nothing (counts of electrons), else as float64."""
     with np.errstate(over="ignore"):
         small = array.astype(np.float32)
-    return (
-        small if np.array_equal(small.astype(np.float64), array, equal_nan=True) else array.astype(np.float64)
-    )
+    return small if np.array_equal(small.astype(np.float64), array, equal_nan=True) else array.astype(np.float64)

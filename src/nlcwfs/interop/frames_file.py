@@ -90,9 +90,7 @@ class FramesFile:
         for name, shapes in allowed.items():
             array = getattr(self, name)
             if array is not None and array.shape not in shapes:
-                raise SettingsError(
-                    f"frames.{name}", f"must have the pixels of the frames, {shapes[0]}", array.shape
-                )
+                raise SettingsError(f"frames.{name}", f"must have the pixels of the frames, {shapes[0]}", array.shape)
 
     def photo_electrons(self) -> Float[np.ndarray, "frame plane y x"]:
         """The light alone: electrons less background and dark; 0 in masked pixels."""

@@ -132,15 +132,11 @@ def _distances_m(keywords: Keywords, plane_count: int) -> tuple[float, ...]:
         raise keywords.error(f"ZPLANE1..{plane_count}", rule, f"{len(present)} ({listed})")
     distances_m = tuple(keywords.number(present[i], "must be a number of metres", _any) for i in wanted)
     if not any(distances_m):
-        raise keywords.error(
-            f"ZPLANE1..{plane_count}", "must hold a plane out of the pupil", "0 for every plane"
-        )
+        raise keywords.error(f"ZPLANE1..{plane_count}", "must hold a plane out of the pupil", "0 for every plane")
     for later, distance_m in enumerate(distances_m):
         first = distances_m.index(distance_m)
         if first < later:
-            raise keywords.error(
-                f"ZPLANE{later + 1}", f"must differ from ZPLANE{first + 1}", f"{distance_m:g} in both"
-            )
+            raise keywords.error(f"ZPLANE{later + 1}", f"must differ from ZPLANE{first + 1}", f"{distance_m:g} in both")
     return distances_m
 
 

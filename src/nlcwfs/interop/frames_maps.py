@@ -30,9 +30,7 @@ def pupil_map(
         raise keywords.error("PUPIL", "must let light through", f"{pupil.max():g} at most")
     extent_m = max(np.ptp(index) + 1 for index in np.nonzero(pupil >= 0.5)) * pixel_m
     if abs(extent_m - diameter_m) > 0.1 * diameter_m + 2 * pixel_m:
-        return pupil, [
-            f"PUPIL: is {extent_m:.3g} m wide, but TELDIAM is {diameter_m:g} m; is PIXSCALE right?"
-        ]
+        return pupil, [f"PUPIL: is {extent_m:.3g} m wide, but TELDIAM is {diameter_m:g} m; is PIXSCALE right?"]
     return pupil, []
 
 
@@ -72,9 +70,7 @@ def background_map(
     return background * electrons_per_unit
 
 
-def truth_map(
-    keywords: Keywords, part: Hdu, *, frame_count: int, shape: tuple[int, int]
-) -> Float[np.ndarray, "..."]:
+def truth_map(keywords: Keywords, part: Hdu, *, frame_count: int, shape: tuple[int, int]) -> Float[np.ndarray, "..."]:
     """The true wavefront in metres, one for all frames or one per frame; it may be NaN outside the pupil.
 
     Raises:

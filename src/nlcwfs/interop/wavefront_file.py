@@ -186,14 +186,8 @@ def _check_fits(number: int, frame: FrameWavefront, shape: tuple[int, ...], mode
     if not 0 <= number < shape[0]:
         raise SettingsError(where, f"must be one of the {shape[0]} frames, counted from 0", number)
     if frame.opd_m.shape != shape[2:]:
-        raise SettingsError(
-            f"{where}.opd_m", f"must have the pixels of the frames, {shape[2:]}", frame.opd_m.shape
-        )
+        raise SettingsError(f"{where}.opd_m", f"must have the pixels of the frames, {shape[2:]}", frame.opd_m.shape)
     if frame.coefficient_m.shape != (mode_count,) or frame.sigma_m.shape != (mode_count,):
-        raise SettingsError(
-            f"{where}.coefficient_m", f"must be one per mode, {mode_count}", frame.coefficient_m.shape
-        )
+        raise SettingsError(f"{where}.coefficient_m", f"must be one per mode, {mode_count}", frame.coefficient_m.shape)
     if frame.residual is not None and frame.residual.shape != shape[1:]:
-        raise SettingsError(
-            f"{where}.residual", f"must have the planes of a frame, {shape[1:]}", frame.residual.shape
-        )
+        raise SettingsError(f"{where}.residual", f"must have the planes of a frame, {shape[1:]}", frame.residual.shape)

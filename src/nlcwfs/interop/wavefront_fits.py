@@ -66,9 +66,7 @@ def write_wavefront(path: str | Path, wavefront: WavefrontFile, provenance: Prov
     hdus: list[Any] = [fits.PrimaryHDU(opd_m, header_of(cards))]
     hdus.append(fits.BinTableHDU.from_columns(_mode_columns(wavefront), name="MODES"))
     if wavefront.residual is not None:
-        residual = (wavefront.residual if wavefront.has_frame_axis else wavefront.residual[0]).astype(
-            np.float32
-        )
+        residual = (wavefront.residual if wavefront.has_frame_axis else wavefront.residual[0]).astype(np.float32)
         about = ("BUNIT", "electron", "data - model")
         header = header_of([about, *position_cards(residual.shape, wavefront.pixel_m)])
         hdus.append(fits.ImageHDU(residual, header, name="RESIDUAL"))
@@ -163,9 +161,7 @@ def _frame_columns(wavefront: WavefrontFile) -> list[fits.Column]:
         if values is not None:
             unit = {"nm": "nm", "_s": "s"}.get(name[-2:])
             whole = np.issubdtype(values.dtype, np.integer)
-            columns.append(
-                fits.Column(name, "J" if whole else "D", unit=None if whole else unit, array=values)
-            )
+            columns.append(fits.Column(name, "J" if whole else "D", unit=None if whole else unit, array=values))
     return columns
 
 
@@ -212,9 +208,7 @@ def _modes(keywords: Keywords, parts: dict[str, Hdu], frame_count: int) -> dict[
     return fields
 
 
-def _table(
-    keywords: Keywords, parts: dict[str, Hdu], name: str, columns: tuple[str, ...], rows: int | None
-) -> Any:
+def _table(keywords: Keywords, parts: dict[str, Hdu], name: str, columns: tuple[str, ...], rows: int | None) -> Any:
     table = parts[name].data if name in parts else None
     names = None if table is None else table.dtype.names
     if table is None or names is None:

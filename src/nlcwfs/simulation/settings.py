@@ -16,9 +16,7 @@ class SimulationSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    frames: int = Field(
-        default=1, ge=1, le=1_000_000, description="Independent exposures, each of another sky."
-    )
+    frames: int = Field(default=1, ge=1, le=1_000_000, description="Independent exposures, each of another sky.")
     light_oversampling: int = Field(
         default=4, ge=2, le=32, description="Cells of the light's grid along a side of a detector pixel."
     )

@@ -1,0 +1,299 @@
+"""The whole way from counts to a wavefront: start, coarse to fine, unwrapping, verdict."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nlcwfs.atmosphere.phase_screen import Turbulence
+from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.estimation import gerchberg_saxton as gs
+from nlcwfs.estimation.centroid_tilt import centroid_tilt
+from nlcwfs.estimation.fit_quality import fit_quality, verdict
+from nlcwfs.estimation.iterate import iterate
+from nlcwfs.estimation.ladder import build_ladder
+from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.speckle_blur import SPEED
+from nlcwfs.estimation.turbulence_filter import expected_error
+from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
+from nlcwfs.estimation.unwrapping import SlopeUnwrapper
+from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+
+TYPICAL_SEEING_ARCSEC = 0.6
+"""Strength 1 of the turbulence: Table 1 of the paper."""
+
+FIRST_STRENGTH_AT_FRIED = 0.1
+"""Unknown turbulence starts as if r0 were a tenth of the telescope: weak enough to be captured."""
+
+SENSOR_LOSS = 2.0
+"""A sensor of speckles needs about twice the photons of the quantum limit, 1 / (4 N) rad^2 (study 01)."""
+
+
+LARGEST_BEYOND = 3.0
+"""Unmodelled variance (rad^2) beyond which steps grow no further."""
+
+
+class GerchbergSaxton(eqx.Module):
+    """Reconstructs wavefronts of one sensor with the paper's algorithm.
+
+    Build it once, then call `estimate` for every exposure; it may be compiled (`equinox.filter_jit`) and mapped
+    over frames (`jax.vmap`).
+
+    Examples:
+        >>> from nlcwfs.beam.grid import Grid
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> geometry = SensorGeometry(
+        ...     pupil=PupilShape(diameter_m=8.0),
+        ...     frame=Grid((32, 32), pixel_m=0.36),
+        ...     wavelength_m=0.65e-6,
+        ...     distances_m=(-3.5e6, 3.5e6),
+        ... )
+        >>> solver = GerchbergSaxton.build(geometry, EstimationSettings())
+        >>> counts = jnp.ones((2, 32, 32))
+        >>> estimate = solver.estimate(counts, jnp.ones((2, 32, 32), bool))
+        >>> estimate.opd_m.shape
+        (32, 32)
+    """
+
+    levels: tuple[Level, ...]
+    unwrapper: SlopeUnwrapper | None
+    first_strength: Float[Array, ""]
+    settings: EstimationSettings = eqx.field(static=True)
+    geometry: SensorGeometry = eqx.field(static=True)
+    measures_strength: bool = eqx.field(static=True)
+
+    @classmethod
+    def build(
+        cls,
+        geometry: SensorGeometry,
+        settings: EstimationSettings,
+        *,
+        basis: ModalBasis | None = None,
+        dtype: str = "float32",
+    ) -> "GerchbergSaxton":
+        """Precompute filters, travel and projections.
+
+        Args:
+            geometry: The sensor.
+            settings: Options; `seeing_arcsec` left out means that the strength is measured.
+            basis: Modes on the frames' pixels, needed for `unwrapping = "slopes"`.
+            dtype: Precision.
+
+        Raises:
+            SettingsError: If an option contradicts another.
+            SamplingError: If the pupil does not fit on the frames.
+        """
+        air = Turbulence.from_seeing(seeing_arcsec=settings.seeing_arcsec or TYPICAL_SEEING_ARCSEC)
+        telescope_over_fried = geometry.pupil.diameter_m / air.fried_at(geometry.wavelength_m)
+        measures = settings.seeing_arcsec is None
+        weaker = (1 / FIRST_STRENGTH_AT_FRIED / telescope_over_fried) ** (5 / 3) if measures else 1.0
+        unwrapper = None
+        if settings.unwrapping == "slopes" and basis is not None:
+            unwrapper = SlopeUnwrapper.build(basis, passes=settings.remainder_passes, dtype=dtype)
+        return cls(
+            levels=build_ladder(geometry, settings.gerchberg_saxton, air, dtype=dtype),
+            unwrapper=unwrapper,
+            first_strength=jnp.asarray(weaker, dtype),
+            settings=settings,
+            geometry=geometry,
+            measures_strength=measures,
+        )
+
+    def estimate(
+        self,
+        counts: Float[Array, "plane y x"],
+        usable: Bool[Array, "plane y x"],
+        *,
+        read_variance: float | Float[Array, ""] = 0.0,
+        start_m: Float[Array, "y x"] | None = None,
+    ) -> WavefrontEstimate:
+        """The wavefront behind one exposure.
+
+        Args:
+            counts: Photo-electrons on the frames' pixels, background subtracted.
+            usable: False for pixels to ignore.
+            read_variance: Variance of a pixel without light, electrons squared.
+            start_m: Wavefront to start from, same pixels; replaces the start of the settings.
+
+        Returns:
+            The estimate on the frames' pixels.
+        """
+        dtype = self.first_strength.dtype
+        measured = Measurement(counts.astype(dtype), usable, jnp.asarray(read_variance, dtype))
+        measured = measured.padded(self.levels[-1].measured_shape)
+        slope = self._starting_slope(measured, start_m)
+        climb = Climb(
+            phase_rad=self._starting_phase(start_m, slope),
+            strength=self.first_strength,
+            iterations=jnp.asarray(0, jnp.int32),
+            ffts=jnp.asarray(0, jnp.int32),
+            change_rad=jnp.asarray(jnp.inf, dtype),
+        )
+        for level in self.levels:
+            climb = self._climb(level, measured.binned(level.binning), slope, climb)
+        return self._account(measured, slope, climb)
+
+    def _climb(self, level: Level, measured: Measurement, slope: Float[Array, "2"], climb: "Climb") -> "Climb":
+        """All the cutoffs of one level."""
+        options = self.settings.gerchberg_saxton
+        carried = options.filter == "turbulence"
+        tilt_rad = tilt_phase(slope, level.grid, self.geometry.wavelength_m)
+        static_rad = level.optics.static_opd_m * (2 * np.pi / self.geometry.wavelength_m)
+        weights = jnp.asarray(slope_weights(level.grid), tilt_rad.dtype)
+        noise = SENSOR_LOSS * gs.phase_noise(level, measured)
+        learns = self.measures_strength and carried and level is not self.levels[-1]
+
+        if level.smoothing is not None:
+            measured = measured.smoothed(level.smoothing)
+
+        def one_cutoff(climb: Climb, cutoff: Int[Array, ""]) -> tuple[Climb, None]:
+            power = level.power[cutoff]
+            problem = problem_at(level, measured, tilt_rad + static_rad, cutoff, climb.strength)
+            state = iterate(
+                lambda state: gs.step(problem, options, state),
+                lambda state: gs.terminate(problem, state),
+                gs.init(climb.phase_rad),
+            )
+            strength = climb.strength
+            if learns:
+                whole_rad = state.phase_rad + tilt_rad
+                strength = updated_strength(strength, whole_rad, level.light, power, weights, noise)
+            ffts = state.iteration * gs.ffts_per_iteration(
+                measured.counts.shape[0], options, blurs=level.structures is not None
+            )
+            climb = Climb(
+                state.phase_rad,
+                strength,
+                climb.iterations + state.iteration,
+                climb.ffts + ffts,
+                state.change_rad,
+            )
+            return climb, None
+
+        phase_rad = resample_phase(climb.phase_rad, level.grid.shape, wrapped=not carried)
+        climb = eqx.tree_at(lambda c: c.phase_rad, climb, phase_rad)
+        return jax.lax.scan(one_cutoff, climb, jnp.arange(level.power.shape[0]))[0]
+
+    def _starting_slope(self, measured: Measurement, start_m: Float[Array, "y x"] | None) -> Float[Array, "2"]:
+        """The tilt (y, x) that the whole reconstruction is relative to, metres per metre."""
+        frame = self.geometry.frame
+        if start_m is not None:
+            return mean_slope(start_m, jnp.asarray(self.geometry.pupil.on(frame) ** 2, start_m.dtype), frame)
+        if self.settings.gerchberg_saxton.start == "flat":
+            return jnp.zeros(2, measured.counts.dtype)
+        return centroid_tilt(
+            measured.counts,
+            measured.usable.astype(measured.counts.dtype),
+            np.array(self.geometry.distances_m),
+            pixel_m=frame.pixel_m,
+        )
+
+    def _starting_phase(self, start_m: Float[Array, "y x"] | None, slope: Float[Array, "2"]) -> Float[Array, "y x"]:
+        """The rest of the first guess, on the grid of the first level."""
+        level, frame = self.levels[0], self.geometry.frame
+        if start_m is None:
+            return jnp.zeros(level.grid.shape, self.first_strength.dtype)
+        scale = 2 * np.pi / self.geometry.wavelength_m
+        rest_rad = start_m.astype(slope.dtype) * scale - tilt_phase(slope, frame, self.geometry.wavelength_m)
+        whole = self.levels[-1].measured_shape
+        margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(whole, frame.shape, strict=True)]
+        return resample_phase(jnp.pad(rest_rad, margins), level.grid.shape, wrapped=False)
+
+    def _account(self, measured: Measurement, slope: Float[Array, "2"], climb: "Climb") -> WavefrontEstimate:
+        """Unwrap, compare with the counts, judge."""
+        level, wavelength_m = self.levels[-1], self.geometry.wavelength_m
+        tilt_rad = tilt_phase(slope, level.grid, wavelength_m)
+        static_rad = level.optics.static_opd_m * (2 * np.pi / wavelength_m)
+        planes = jnp.arange(measured.counts.shape[0])
+        near = gs.pupil_light(level, climb.phase_rad + tilt_rad + static_rad)
+        far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * level.optics.transfer[0])
+        model = gs.modelled_counts(level, measured, far, planes)
+        misfit = fit_quality(measured, model)
+        phase_rad = self._on_frame(climb.phase_rad + tilt_rad)
+        if self.unwrapper is not None:
+            phase_rad = self.unwrapper.unwrapped(phase_rad)
+        opd_m = phase_rad * (wavelength_m / (2 * np.pi))
+        light = self._on_frame(level.light)
+        opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
+        noise = SENSOR_LOSS * gs.phase_noise(level, measured)
+        residual = jnp.where(measured.usable, measured.counts - model, 0)
+        return WavefrontEstimate(
+            opd_m=opd_m,
+            predicted_error_m=expected_error(level.power[0] * climb.strength, noise, level.grid)
+            * (wavelength_m / (2 * np.pi)),
+            misfit=misfit,
+            residual=jnp.stack([_cropped(plane, self.geometry.frame.shape) for plane in residual]),
+            iterations=climb.iterations,
+            ffts=climb.ffts + planes.size + 1,
+            outcome_code=verdict(
+                misfit=misfit,
+                plane_counts=jnp.sum(jnp.where(measured.usable, measured.counts, 0), axis=(1, 2)),
+                rests=climb.change_rad < level.tolerance_rad,
+                finite=jnp.all(jnp.isfinite(opd_m)),
+            ),
+            strength=climb.strength,
+        )
+
+    def _on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
+        """From the finest grid to the pixels of the frames: the mean over each."""
+        factor = self.levels[-1].oversampling
+        return _cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)
+
+
+class Climb(eqx.Module):
+    """What one level hands to the next.
+
+    Attributes:
+        phase_rad: The phase found, without the starting tilt.
+        strength: Variance of the turbulence over that of the filters.
+        iterations: Iterations so far.
+        ffts: Two-dimensional FFTs so far.
+        change_rad: How much the last iteration moved the phase.
+    """
+
+    phase_rad: Float[Array, "y x"]
+    strength: Float[Array, ""]
+    iterations: Int[Array, ""]
+    ffts: Int[Array, ""]
+    change_rad: Float[Array, ""]
+
+
+def problem_at(
+    level: Level,
+    measured: Measurement,
+    reference_rad: Float[Array, "y x"],
+    cutoff: Int[Array, ""],
+    strength: Float[Array, ""],
+) -> gs.Problem:
+    """What one cutoff of a level has to solve, for turbulence of this strength."""
+    # Blurred images answer the phase more weakly, by the coherence that is left: steps grow by its inverse.
+    gain = level.gain * jnp.exp(jnp.minimum(strength * level.beyond[cutoff], LARGEST_BEYOND))
+    blur = None
+    if level.structures is not None and level.smoothing is not None:
+        blur = level.smoothing[None] * jnp.exp(-0.5 * SPEED * strength * level.structures[cutoff])
+    noise = gain * gs.phase_noise(level, measured)
+    return gs.Problem(level, measured, reference_rad, level.power[cutoff] * strength, noise, gain, blur)
+
+
+def tilt_phase(slope: Float[Array, "2"], grid: Grid, wavelength_m: float) -> Float[Array, "y x"]:
+    """Phase of a plane wave with this slope (y, x)."""
+    y_m, x_m = jnp.asarray(grid.y_m, slope.dtype), jnp.asarray(grid.x_m, slope.dtype)
+    return (slope[0] * y_m + slope[1] * x_m) * (2 * np.pi / wavelength_m)
+
+
+def mean_slope(opd_m: Float[Array, "y x"], light: Float[Array, "y x"], grid: Grid) -> Float[Array, "2"]:
+    """Tilt (y, x) of a wavefront by least squares over the light of the pupil."""
+    y_m = jnp.asarray(np.broadcast_to(grid.y_m, grid.shape), opd_m.dtype)
+    x_m = jnp.asarray(np.broadcast_to(grid.x_m, grid.shape), opd_m.dtype)
+    planes = jnp.stack([jnp.ones_like(y_m), y_m, x_m]).reshape(3, -1)
+    weighted = planes * light.reshape(1, -1)
+    return jnp.linalg.solve(weighted @ planes.T, weighted @ opd_m.reshape(-1))[1:]
+
+
+def _cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:
+    rows, columns = ((outer - inner) // 2 for outer, inner in zip(array.shape, shape, strict=True))
+    return array[rows : rows + shape[0], columns : columns + shape[1]]

@@ -1,0 +1,54 @@
+"""What a reconstructor must know of the sensor whose frames it gets."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Float
+
+from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.pupil_shape import PupilShape
+from nlcwfs.beam.spectrum import Spectrum
+from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
+
+
+@dataclass(frozen=True)
+class SensorGeometry:
+    """Pupil, planes and pixels of a real sensor.
+
+    Attributes:
+        pupil: The telescope.
+        frame: Pixels of one plane's frame, at the scale of the telescope.
+        wavelength_m: Wavelength of sensing.
+        distances_m: Signed distance of each plane from the pupil, positive downstream.
+        flux_fractions: Share of the light of each plane; equal when left out.
+        static_opd_m: Known aberration in the arm of the sensor, on the frame's pixels.
+    """
+
+    pupil: PupilShape
+    frame: Grid
+    wavelength_m: float
+    distances_m: tuple[float, ...]
+    flux_fractions: tuple[float, ...] | None = None
+    static_opd_m: Float[np.ndarray, "y x"] | None = field(default=None, compare=False)
+
+    def model(self, grid: Grid, *, dtype: str) -> CurvatureSensor:
+        """The sensor's optics on a grid of the reconstructor."""
+        static = None if self.static_opd_m is None else _resized(self.static_opd_m, self.frame, grid)
+        return CurvatureSensor.build(
+            self.pupil.on(grid),
+            grid,
+            distances_m=self.distances_m,
+            spectrum=Spectrum.monochromatic(self.wavelength_m),
+            flux_fractions=self.flux_fractions,
+            static_opd_m=static,
+            dtype=dtype,
+        )
+
+
+def _resized(opd_m: Float[np.ndarray, "y x"], frame: Grid, grid: Grid) -> Float[np.ndarray, "v u"]:
+    """A smooth aberration on other pixels, by cubic splines; the rim goes on beyond the frame."""
+    rows = grid.y_m.ravel() / frame.pixel_m + (frame.shape[0] - 1) / 2
+    columns = grid.x_m.ravel() / frame.pixel_m + (frame.shape[1] - 1) / 2
+    points = np.meshgrid(rows, columns, indexing="ij")
+    return scipy.ndimage.map_coordinates(opd_m, points, order=3, mode="nearest")
