@@ -43,7 +43,7 @@ def unmodelled_structure(
 
 def unmodelled_variance(turbulence: Turbulence, *, wavelength_m: float, cutoff_per_m: float) -> float:
     """Variance of the turbulent phase beyond a spatial frequency, rad^2 (Kolmogorov's spectrum)."""
-    power = float(turbulence.opd_spectrum(np.array(cutoff_per_m))) * (2 * np.pi / wavelength_m) ** 2
+    power = float(turbulence.opd_spectrum(np.array([cutoff_per_m]))[0]) * (2 * np.pi / wavelength_m) ** 2
     return 2 * np.pi * power * cutoff_per_m**2 * 3 / 5
 
 
