@@ -1,0 +1,59 @@
+# A fresh machine needs Python >= 3.11, git and make; everything else comes into .venv at the first call.
+# Another Python: `make demo PYTHON=python3.12`.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+# Tests run in parallel, and matrix products of many threads in many processes fight for the cores.
+SINGLE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
+WORKERS := auto --maxprocesses 8
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint docs pytest studies bench clean
+
+help:  ## Say what there is
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-8s %s\n", $$1, $$2}'
+
+demo: $(VENV)/.installed  ## A star through an 8 m telescope, its wavefront, a picture and the error in nm
+	$(BIN)/nlcwfs demo
+
+test: lint docs pytest  ## Everything that CI runs; ends with the summary of the tests
+
+lint: $(VENV)/.installed-dev  ## Style, format, types, and light that only travels forward
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+docs: $(VENV)/.installed-dev  ## The pages of docs/ as HTML in docs/_build; a warning is an error
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
+	@echo "Open docs/_build/index.html"
+
+pytest: $(VENV)/.installed-dev  ## Tests and the examples in the docstrings
+	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q
+
+studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that take minutes
+	$(BIN)/nlcwfs study 01-single-frame
+	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
+
+bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs
+	$(BIN)/python bench/gerchberg_saxton.py
+
+clean:  ## Back to a fresh clone, but for changes of yours
+	rm -rf $(VENV) docs/_build demo dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "nlcwfs needs Python >= 3.11, got `$(PYTHON) --version`; try make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	$(PIP) install --quiet -e .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
+	$(PIP) install --quiet -e '.[test,docs]'
+	@touch $@ $(VENV)/.installed
