@@ -5,9 +5,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, modulus_factor
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
@@ -41,6 +41,7 @@ class Problem(NamedTuple):
         power: Expected power of the phase up to the present cutoff, see `turbulence_filter`.
         noise: Variance of the phase of a fully lit pixel after a step, rad^2, for the filter.
         gain: Length of a step.
+        low_pass: Factor on the spectrum of the returning light; None without that filter.
         blur: Fourier factor of the model's images, for the turbulence that is not modelled yet; None for none.
     """
 
@@ -50,6 +51,7 @@ class Problem(NamedTuple):
     power: Float[Array, "y fx"]
     noise: Float[Array, ""]
     gain: Float[Array, ""]
+    low_pass: Float[Array, "y x"] | None
     blur: Float[Array, "plane v fu"] | None
 
 
@@ -121,8 +123,8 @@ def _through_planes(
     share = level.optics.flux_fractions[planes]
     spectra = jnp.fft.fft2(far * level.on_cells(factor).astype(far.dtype)) * jnp.conj(transfer)
     spectrum = jnp.sum(spectra * (share / jnp.sum(share))[:, None, None].astype(far.dtype), axis=0)
-    if settings.filter == "low-pass":
-        spectrum = spectrum * level.low_pass.astype(far.dtype)
+    if problem.low_pass is not None:
+        spectrum = spectrum * problem.low_pass.astype(far.dtype)
     returned = jnp.fft.ifft2(spectrum)
     turned_rad = jnp.angle(returned * jnp.conj(near)) * level.light
     phase_rad = phase_rad + problem.gain * turned_rad
@@ -177,6 +179,14 @@ def ffts_per_iteration(planes: int, settings: GerchbergSaxtonSettings, *, blurs:
     return planes * (4 + filtering) + blurring
 
 
-def low_pass_factor(frequency_per_m: Float[np.ndarray, "y x"], *, cutoff_per_m: float) -> Float[np.ndarray, "y x"]:
-    """The paper's filtering inside the loop, as a smooth cut of the returning light."""
-    return np.exp(-((frequency_per_m / cutoff_per_m) ** 4))
+def low_pass_factor(grid: Grid, *, cutoff_per_m: float, centre_per_m: Float[Array, "2"]) -> Float[Array, "y x"]:
+    """The paper's filtering inside the loop, as a smooth cut of the returning light, `exp(-(f / cutoff)^4)`.
+
+    Args:
+        grid: Cells of the model.
+        cutoff_per_m: Where the light falls to 1/e.
+        centre_per_m: Frequency (y, x) of the beam's tilt: slope / wavelength.
+    """
+    y_per_m = jnp.asarray(grid.fy_per_m, centre_per_m.dtype) - centre_per_m[0]
+    x_per_m = jnp.asarray(grid.fx_per_m, centre_per_m.dtype) - centre_per_m[1]
+    return jnp.exp(-(((y_per_m**2 + x_per_m**2) / cutoff_per_m**2) ** 2))

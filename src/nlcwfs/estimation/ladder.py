@@ -9,7 +9,6 @@ from jax import numpy as jnp
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.errors import SettingsError
-from nlcwfs.estimation.gerchberg_saxton import low_pass_factor
 from nlcwfs.estimation.resolution_level import Level, lit_fraction
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
@@ -105,7 +104,6 @@ def _level(
         if limit
     ]
     smoothing = smoothing_factor(measured, radius_m=settings.smoothing_pixels * geometry.frame.pixel_m)
-    low_pass = low_pass_factor(np.hypot(grid.fy_per_m, grid.fx_per_m), cutoff_per_m=settings.low_pass_cpa / diameter_m)
     return Level(
         optics=optics,
         light=jnp.asarray(lit_fraction(np.asarray(optics.pupil)), dtype),
@@ -113,7 +111,6 @@ def _level(
         structures=jnp.asarray(np.array(structures), dtype) if smooths else None,
         beyond=jnp.asarray(beyond, dtype),
         smoothing=jnp.asarray(smoothing, dtype) if smooths else None,
-        low_pass=jnp.asarray(low_pass, dtype),
         grid=grid,
         binning=binning,
         oversampling=oversampling,

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
-from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis
 from nlcwfs.estimation import gerchberg_saxton as gs
 from nlcwfs.estimation.centroid_tilt import centroid_tilt
@@ -18,6 +17,7 @@ from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phas
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.speckle_blur import SPEED
+from nlcwfs.estimation.tilt import mean_slope, tilt_phase
 from nlcwfs.estimation.turbulence_filter import expected_error
 from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
 from nlcwfs.estimation.unwrapping import SlopeUnwrapper
@@ -44,8 +44,7 @@ class GerchbergSaxton(eqx.Module):
     over frames (`jax.vmap`).
 
     Examples:
-        >>> from nlcwfs.beam.grid import Grid
-        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>>         >>> from nlcwfs.beam.pupil_shape import PupilShape
         >>> geometry = SensorGeometry(
         ...     pupil=PupilShape(diameter_m=8.0),
         ...     frame=Grid((32, 32), pixel_m=0.36),
@@ -147,12 +146,19 @@ class GerchbergSaxton(eqx.Module):
         noise = SENSOR_LOSS * gs.phase_noise(level, measured)
         learns = self.measures_strength and carried and level is not self.levels[-1]
 
+        low_pass = None
+        if options.filter == "low-pass":
+            low_pass = gs.low_pass_factor(
+                level.grid,
+                cutoff_per_m=options.low_pass_cpa / self.geometry.pupil.diameter_m,
+                centre_per_m=slope / self.geometry.wavelength_m,
+            )
         if level.smoothing is not None:
             measured = measured.smoothed(level.smoothing)
 
         def one_cutoff(climb: Climb, cutoff: Int[Array, ""]) -> tuple[Climb, None]:
             power = level.power[cutoff]
-            problem = problem_at(level, measured, tilt_rad + static_rad, cutoff, climb.strength)
+            problem = problem_at(level, measured, tilt_rad + static_rad, cutoff, climb.strength, low_pass)
             state = iterate(
                 lambda state: gs.step(problem, options, state),
                 lambda state: gs.terminate(problem, state),
@@ -268,6 +274,7 @@ def problem_at(
     reference_rad: Float[Array, "y x"],
     cutoff: Int[Array, ""],
     strength: Float[Array, ""],
+    low_pass: Float[Array, "y x"] | None,
 ) -> gs.Problem:
     """What one cutoff of a level has to solve, for turbulence of this strength."""
     # Blurred images answer the phase more weakly, by the coherence that is left: steps grow by its inverse.
@@ -276,22 +283,7 @@ def problem_at(
     if level.structures is not None and level.smoothing is not None:
         blur = level.smoothing[None] * jnp.exp(-0.5 * SPEED * strength * level.structures[cutoff])
     noise = gain * gs.phase_noise(level, measured)
-    return gs.Problem(level, measured, reference_rad, level.power[cutoff] * strength, noise, gain, blur)
-
-
-def tilt_phase(slope: Float[Array, "2"], grid: Grid, wavelength_m: float) -> Float[Array, "y x"]:
-    """Phase of a plane wave with this slope (y, x)."""
-    y_m, x_m = jnp.asarray(grid.y_m, slope.dtype), jnp.asarray(grid.x_m, slope.dtype)
-    return (slope[0] * y_m + slope[1] * x_m) * (2 * np.pi / wavelength_m)
-
-
-def mean_slope(opd_m: Float[Array, "y x"], light: Float[Array, "y x"], grid: Grid) -> Float[Array, "2"]:
-    """Tilt (y, x) of a wavefront by least squares over the light of the pupil."""
-    y_m = jnp.asarray(np.broadcast_to(grid.y_m, grid.shape), opd_m.dtype)
-    x_m = jnp.asarray(np.broadcast_to(grid.x_m, grid.shape), opd_m.dtype)
-    planes = jnp.stack([jnp.ones_like(y_m), y_m, x_m]).reshape(3, -1)
-    weighted = planes * light.reshape(1, -1)
-    return jnp.linalg.solve(weighted @ planes.T, weighted @ opd_m.reshape(-1))[1:]
+    return gs.Problem(level, measured, reference_rad, level.power[cutoff] * strength, noise, gain, low_pass, blur)
 
 
 def _cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:

@@ -62,7 +62,6 @@ class Level(eqx.Module):
         beyond: For each cutoff, variance of the phase beyond it, rad^2.
         smoothing: Fourier factor that smooths counts and model alike; None for none.
         doubt: Relative variance of the model's intensity, see `modulus_factor`.
-        low_pass: Factor on the spectrum of the returning light.
         grid: Cells of the model.
         binning: Detector pixels per measured pixel of this level, along an axis.
         oversampling: Cells of the model per measured pixel of this level, along an axis.
@@ -78,7 +77,6 @@ class Level(eqx.Module):
     structures: Float[Array, "cutoff plane v fu"] | None
     beyond: Float[Array, " cutoff"]
     smoothing: Float[Array, "v fu"] | None
-    low_pass: Float[Array, "y x"]
     grid: Grid = eqx.field(static=True)
     binning: int = eqx.field(static=True)
     oversampling: int = eqx.field(static=True)

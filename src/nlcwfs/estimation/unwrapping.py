@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.modes import ModalBasis
@@ -23,6 +24,7 @@ class SlopeUnwrapper(eqx.Module):
         modes: On the lit pixels, one row each.
         weights: Share of the light of each lit pixel, sum 1.
         lit: Rows and columns of the lit pixels.
+        nearest: Number of the lit pixel nearest to each pixel.
         first: One lit pixel of each pair of neighbours.
         second: The other.
         from_slopes: Coefficients for one radian of difference on each pair of neighbours.
@@ -33,6 +35,7 @@ class SlopeUnwrapper(eqx.Module):
     weights: Float[Array, " lit"]
     from_slopes: Float[Array, "mode pair"]
     lit: tuple[Int[Array, " lit"], Int[Array, " lit"]]
+    nearest: Int[Array, "y x"]
     first: Int[Array, " pair"]
     second: Int[Array, " pair"]
     passes: int = eqx.field(static=True)
@@ -62,6 +65,9 @@ class SlopeUnwrapper(eqx.Module):
         rows, columns = np.nonzero(weights > 0)
         number = np.full(weights.shape, -1)
         number[rows, columns] = np.arange(rows.size)
+        nearest = np.asarray(
+            scipy.ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+        )
         pairs = [
             (number[:, :-1], number[:, 1:]),
             (number[:-1, :], number[1:, :]),
@@ -78,6 +84,7 @@ class SlopeUnwrapper(eqx.Module):
             weights=jnp.asarray(lit_weights, dtype),
             from_slopes=jnp.asarray(from_slopes, dtype),
             lit=(jnp.asarray(rows), jnp.asarray(columns)),
+            nearest=jnp.asarray(number[tuple(nearest)]),
             first=jnp.asarray(first),
             second=jnp.asarray(second),
             passes=passes,
@@ -101,9 +108,9 @@ class SlopeUnwrapper(eqx.Module):
         return found
 
     def unwrapped(self, wrapped_rad: Float[Array, "y x"]) -> Float[Array, "y x"]:
-        """The unwrapped phase, as a sum of modes; zero outside the pupil."""
+        """The unwrapped phase, as a sum of modes; each pixel outside the pupil shows its nearest lit one."""
         lit_rad = self.coefficients(wrapped_rad) @ self.modes
-        return jnp.zeros_like(wrapped_rad).at[self.lit[0], self.lit[1]].set(lit_rad.astype(wrapped_rad.dtype))
+        return lit_rad[self.nearest].astype(wrapped_rad.dtype)
 
 
 def wrap(phase_rad: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
