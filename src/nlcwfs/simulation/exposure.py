@@ -1,0 +1,303 @@
+"""One simulated exposure: a turbulent sky, the light on a fine and wide grid, the frames of the detector."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+import scipy.integrate
+import scipy.special
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
+from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.pupil import Spiders, light_weights
+from nlcwfs.beam.pupil_shape import PupilShape
+from nlcwfs.beam.spectrum import Spectrum
+from nlcwfs.config import Config
+from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
+from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
+from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
+from nlcwfs.detector.read import Detector, Frames
+from nlcwfs.errors import SamplingError, SettingsError
+
+SMALLEST_LIGHT = 1e-6
+"""Light of a detector pixel, over a fully lit one, below which it has no wavefront."""
+
+
+class Exposure(eqx.Module):
+    """What happened in one exposure, and what the detector made of it; batches carry a leading frame axis.
+
+    Attributes:
+        opd_m: The star's wavefront on the grid of the light, zero mean over the pupil and zero outside.
+        photons: Mean photons on every detector pixel, without background.
+        frames: What the detector read.
+        truth_m: Mean of `opd_m` over the light of every detector pixel; NaN where there is none.
+        lost: Share of the light of each plane that misses the detector's window.
+    """
+
+    opd_m: Float[Array, "*frame Y X"]
+    photons: Float[Array, "*frame plane y x"]
+    frames: Frames
+    truth_m: Float[Array, "*frame y x"]
+    lost: Float[Array, "*frame plane"]
+
+
+class ExposureSimulator(eqx.Module):
+    """Makes exposures of one sensor under one sky.
+
+    Nothing here is on the grid of a reconstructor: the light has `simulation.light_oversampling` cells to a
+    detector pixel and a window `simulation.light_window` times the detector's (see `docs/decisions`).
+
+    Attributes:
+        shape: The pupil, apart from any grid.
+        light: Grid of the light.
+        air: The turbulence.
+        screens: Draws wavefronts on the part of the grid that holds the pupil.
+        sensor: The optics on the grid of the light.
+        weights: Share of the light in every cell of the pupil, on the grid of the light.
+        detector: The camera.
+        photons: Photons that the whole sensor gets in one exposure.
+        factor: Cells of the light along a detector pixel.
+        window: Detector pixels along y and x.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> small = ["detector.pixels_across_pupil=12", "detector.window_pixels=16", "atmosphere.opd_rms_nm=100"]
+        >>> simulator = ExposureSimulator.build(load_config(None, small))
+        >>> exposure = simulator.expose(frame_key(seed=0, frame=3))
+        >>> exposure.frames.electrons.shape, simulator.light.shape
+        ((4, 16, 16), (128, 128))
+    """
+
+    shape: PupilShape = eqx.field(static=True)
+    light: Grid = eqx.field(static=True)
+    air: Turbulence = eqx.field(static=True)
+    screens: PhaseScreens
+    sensor: CurvatureSensor
+    weights: Float[Array, "y x"]
+    detector: Detector
+    photons: float = eqx.field(static=True)
+    factor: int = eqx.field(static=True)
+    window: tuple[int, int] = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, config: Config, shape: PupilShape | None = None) -> "ExposureSimulator":
+        """Prepare the grids, the optics and the sky of a configuration.
+
+        Args:
+            config: The settings.
+            shape: The pupil, when it is a map that was read from `beam.pupil_map`; else it follows from the settings.
+
+        Raises:
+            SettingsError: If settings contradict each other.
+            SamplingError: If the pupil does not fit in the window.
+        """
+        dtype = "float64" if config.precision == "double" else "float32"
+        shape, air = round_pupil(config) if shape is None else shape, turbulence(config)
+        light = light_grid(config)
+        pupil = shape.on(light)
+        cut = _lit_part(pupil)
+        window = (config.detector.window_pixels,) * 2
+        weights = light_weights(pupil)
+        return cls(
+            shape=shape,
+            light=light,
+            air=air,
+            screens=PhaseScreens.build(air, shape=pupil[cut].shape, pixel_m=light.pixel_m, dtype=dtype),
+            sensor=CurvatureSensor.build(
+                pupil,
+                light,
+                distances_m=distances_m(config),
+                spectrum=Spectrum.monochromatic(wavelength_m(config)),
+                flux_fractions=config.curvature_sensor.flux_fractions,
+                static_opd_m=static_aberration(config, weights, light),
+                dtype=dtype,
+            ),
+            weights=jnp.asarray(weights, dtype),
+            detector=Detector(config.detector),
+            photons=config.atmosphere.photons,
+            factor=config.simulation.light_oversampling,
+            window=window,
+        )
+
+    @property
+    def frame(self) -> Grid:
+        """The pixels of one plane of the detector."""
+        return Grid(self.window, self.light.pixel_m * self.factor)
+
+    @eqx.filter_jit
+    def expose(self, key: PRNGKeyArray) -> Exposure:
+        """Draw a sky and expose the detector once.
+
+        Args:
+            key: Random key of this frame, see `frame_key`.
+        """
+        key_sky, key_detector = jax.random.split(key)
+        return self.expose_to(self._wavefront(key_sky), key_detector)
+
+    @eqx.filter_jit
+    def expose_to(self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray) -> Exposure:
+        """Expose the detector once to a wavefront that is given.
+
+        Args:
+            opd_m: Wavefront on the grid of the light; what lies outside the pupil, and piston, do not count.
+            key: Random key of the detector's noise.
+        """
+        opd_m = opd_m.astype(self.weights.dtype)
+        opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
+        planes = self.sensor.images(opd_m, self.photons).photons
+        photons = integrate_on_pixels(planes, factor=self.factor, window=self.window)
+        return Exposure(
+            opd_m=opd_m,
+            photons=photons,
+            frames=self.detector.read(photons, key),
+            truth_m=self.on_pixels(opd_m),
+            lost=fraction_outside_window(planes, factor=self.factor, window=self.window),
+        )
+
+    def on_pixels(self, opd_m: Float[Array, "Y X"]) -> Float[Array, "y x"]:
+        """Mean of a wavefront over the light of every detector pixel; NaN where there is none."""
+        both = jnp.stack([self.weights, self.weights * opd_m])
+        light, weighted = integrate_on_pixels(both, factor=self.factor, window=self.window)
+        lit = light > SMALLEST_LIGHT * jnp.max(light)
+        return jnp.where(lit, weighted / jnp.where(lit, light, 1), jnp.nan)
+
+    def _wavefront(self, key: PRNGKeyArray) -> Float[Array, "Y X"]:
+        """A screen on the whole grid, zero where there is no pupil."""
+        drawn = self.screens.draw(key)
+        margins = [((whole - part) // 2,) * 2 for whole, part in zip(self.light.shape, drawn.shape, strict=True)]
+        return jnp.pad(drawn, margins)
+
+
+def frame_key(*, seed: int, frame: int) -> PRNGKeyArray:
+    """The random key of a frame: the same however many frames there are.
+
+    Examples:
+        >>> bool((jax.random.key_data(frame_key(seed=1, frame=0)) == jax.random.key_data(jax.random.key(1))).all())
+        False
+    """
+    return jax.random.fold_in(jax.random.key(seed), frame)
+
+
+def wavelength_m(config: Config) -> float:
+    """Wavelength of sensing."""
+    return config.beam.wavelength_um * 1e-6
+
+
+def distances_m(config: Config) -> tuple[float, ...]:
+    """Signed distance of every plane from the pupil."""
+    return tuple(distance_km * 1e3 for distance_km in config.curvature_sensor.distances_km)
+
+
+def round_pupil(config: Config) -> PupilShape:
+    """The round telescope of a configuration.
+
+    Raises:
+        SettingsError: If the configuration names a map instead: reading files is not for this stage.
+    """
+    beam = config.beam
+    if beam.pupil_map is not None:
+        raise SettingsError("beam.pupil_map", "must be read first and handed over as a shape", beam.pupil_map)
+    spiders = None
+    if beam.spider_count:
+        spiders = Spiders.evenly(beam.spider_count, width_m=beam.spider_width_m, first_angle_deg=beam.spider_angle_deg)
+    return PupilShape(beam.diameter_m, beam.obstruction_ratio, spiders)
+
+
+def turbulence(config: Config) -> Turbulence:
+    """The air of a configuration; `opd_rms_nm` rules over the seeing, outer scale included.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> air = turbulence(load_config(None, ["atmosphere.opd_rms_nm=609"]))
+        >>> round(8.0 / air.fried_at(0.65e-6), 1)
+        8.2
+    """
+    sky, diameter_m = config.atmosphere, config.beam.diameter_m
+    outer_scale_m = math.inf if sky.outer_scale_m is None else sky.outer_scale_m
+    if sky.opd_rms_nm is None:
+        return Turbulence.from_seeing(seeing_arcsec=sky.seeing_arcsec, outer_scale_m=outer_scale_m)
+    wanted_m = sky.opd_rms_nm * 1e-9
+    air = Turbulence.from_rms(opd_rms_m=wanted_m, diameter_m=diameter_m)
+    if math.isinf(outer_scale_m):
+        return air
+    air = dataclasses.replace(air, outer_scale_m=outer_scale_m)
+    return dataclasses.replace(air, fried_m=air.fried_m * (mean_rms_m(air, diameter_m) / wanted_m) ** (6 / 5))
+
+
+def mean_rms_m(air: Turbulence, diameter_m: float) -> float:
+    r"""Mean rms of turbulence over a disc, tilt included, piston not.
+
+    :math:`\sigma^2 = \int W(f)\,(1 - (2 J_1(\pi D f) / (\pi D f))^2)\, 2 \pi f\, df` (Noll 1976, sec. 3).
+
+    Examples:
+        >>> air = Turbulence.from_rms(opd_rms_m=609e-9, diameter_m=8.0)
+        >>> round(mean_rms_m(air, 8.0) * 1e9)
+        609
+    """
+    frequency = np.geomspace(1e-15, 1e4, 20000) / diameter_m  # a tilt is carried by very long waves
+    angle = np.pi * diameter_m * frequency
+    piston = (2 * scipy.special.j1(angle) / angle) ** 2
+    # 1 - piston is (angle / 2)^2 for long waves, where the difference has lost its digits.
+    kept = np.where(angle < 1e-3, (angle / 2) ** 2, 1 - piston)
+    density = air.opd_spectrum(frequency) * kept * 2 * np.pi * frequency
+    return math.sqrt(float(scipy.integrate.trapezoid(density * frequency, np.log(frequency))))
+
+
+def seeing_arcsec(air: Turbulence) -> float:
+    """Seeing at 500 nm: full width of a long exposure in Kolmogorov turbulence of this Fried parameter."""
+    return SEEING_TO_FRIED * SEEING_WAVELENGTH_M / air.fried_at(SEEING_WAVELENGTH_M) / ARCSEC_RAD
+
+
+def light_grid(config: Config) -> Grid:
+    """The grid of the light: centred on the detector's window, and of a size that suits the FFT.
+
+    Examples:
+        >>> light_grid(Config()).shape
+        (1024, 1024)
+    """
+    detector, simulation = config.detector, config.simulation
+    inner = detector.window_pixels * simulation.light_oversampling
+    size = math.ceil(inner * simulation.light_window)
+    while (size - inner) % 2 or size != scipy.fft.next_fast_len(size):
+        size += 1  # odd around odd, even around even: the centres agree
+    pixel_m = config.beam.diameter_m / (detector.pixels_across_pupil * simulation.light_oversampling)
+    return Grid((size, size), pixel_m)
+
+
+def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: Grid) -> Float[np.ndarray, "Y X"]:
+    """The known aberration in the arm of the sensor: Kolmogorov without piston and tilt, of exactly its rms.
+
+    Tilt is left out because it moves all images alike in angle: alignment takes it away.
+    """
+    rms_m = config.curvature_sensor.static_rms_nm * 1e-9
+    if rms_m == 0:
+        return np.zeros(grid.shape)
+    cut = _lit_part(weights)
+    screens = PhaseScreens.build(Turbulence(1.0), shape=weights[cut].shape, pixel_m=grid.pixel_m)
+    drawn = np.asarray(screens.draw(jax.random.key(config.curvature_sensor.static_seed)), float)
+    planes = np.stack([axis[cut] for axis in np.broadcast_arrays(1.0, grid.y_m, grid.x_m)])
+    weighted = planes * weights[cut]
+    slopes = np.linalg.solve(np.einsum("ayx,byx->ab", weighted, planes), np.einsum("ayx,yx->a", weighted, drawn))
+    bent = np.where(weights[cut] > 0, drawn - np.einsum("a,ayx->yx", slopes, planes), 0)
+    return centred_in(bent * (rms_m / math.sqrt(np.sum(weights[cut] * bent**2))), grid.shape)
+
+
+def _lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
+    """The smallest part of a grid that holds all the light and has the grid's centre.
+
+    Raises:
+        SamplingError: If there is no light.
+    """
+    slices = []
+    for size, lit in zip(pupil.shape, (pupil.any(axis=1), pupil.any(axis=0)), strict=True):
+        index = np.flatnonzero(lit)
+        if not index.size:
+            raise SamplingError("beam.pupil_map", "must let light through on the grid of the light", "no light")
+        margin = int(min(index[0], size - 1 - index[-1]))
+        slices.append(slice(margin, size - margin))
+    return slices[0], slices[1]
