@@ -34,6 +34,7 @@ class FramesFile:
         frame_problems: Frames that cannot be used, by number from 0, and why.
         warnings: What the user should know, a sentence each.
         source: The file it was read from.
+        source_digest: First digits of the SHA-256 of that file, to know it again.
 
     Raises:
         SettingsError: If the arrays contradict each other.
@@ -73,6 +74,7 @@ class FramesFile:
     frame_problems: dict[int, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     source: str = ""
+    source_digest: str = ""
 
     def __post_init__(self) -> None:
         shape = self.electrons.shape

@@ -1,5 +1,6 @@
 """The frames of a sensor in FITS, as benches write them and as `simulate` does."""
 
+import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,6 +72,7 @@ def read_frames(path: str | Path) -> FramesFile:
         frame_problems=problems,
         warnings=tuple(notes + map_notes + frame_warnings(reports, rules.flux_fractions)),
         source=path.name,
+        source_digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
         **fields,
         **maps,
     )

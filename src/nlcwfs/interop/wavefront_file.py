@@ -64,6 +64,7 @@ class WavefrontFile:
         noll: Noll index of every mode.
         residual: Data - model in electrons; None when not kept.
         source: The file the frames came from.
+        source_digest: First digits of the SHA-256 of that file.
     """
 
     opd_m: Float[np.ndarray, "frame y x"]
@@ -85,6 +86,7 @@ class WavefrontFile:
     error_nm: Float[np.ndarray, " frame"] | None = None
     residual: Float[np.ndarray, "frame plane y x"] | None = None
     source: str = ""
+    source_digest: str = ""
 
     @classmethod
     def from_frames(
@@ -152,6 +154,7 @@ class WavefrontFile:
             error_nm=column("error_nm", np.nan) if scored else None,
             residual=column("residual", no_residual) if explained else None,
             source=frames.source,
+            source_digest=frames.source_digest,
         )
 
     @property

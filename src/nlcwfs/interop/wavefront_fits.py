@@ -63,6 +63,8 @@ def write_wavefront(path: str | Path, wavefront: WavefrontFile, provenance: Prov
     ]
     if wavefront.source:
         cards.append(("INPUT", wavefront.source, ""))
+    if wavefront.source_digest:
+        cards.append(("INSHA256", wavefront.source_digest, "first digits, of the input"))
     hdus: list[Any] = [fits.PrimaryHDU(opd_m, header_of(cards))]
     hdus.append(fits.BinTableHDU.from_columns(_mode_columns(wavefront), name="MODES"))
     if wavefront.residual is not None:
@@ -105,6 +107,7 @@ def read_wavefront(path: str | Path) -> WavefrontFile:
         method=method,
         residual=residual,
         source=str(keywords.value("INPUT") or ""),
+        source_digest=str(keywords.value("INSHA256") or ""),
         **lengths,
         **columns,
         **_modes(keywords, parts, len(opd_m)),
