@@ -85,7 +85,7 @@ class SamplingWarning:
 def sampling_needed(light: SensedLight, distances_m: Sequence[float]) -> SamplingNeed:
     """Pixels and window after Guyon 2010, sec. 2.5, with its factor of two mended.
 
-    The window is D + 2 |z| alpha. Speckles are lambda |z| / D wide and need two pixels, so the window holds
+    The window is `D + 2 |z| alpha`. Speckles are `lambda |z| / D` wide and need two pixels, so the window holds
     N = 2 D (D + 2 z alpha) / (lambda z) pixels; at z0 = D / (2 alpha) that is 8 D alpha / lambda, twice what
     the paper prints. Nearer than z0 the law would ask for ever finer pixels, but light that stays within
     alpha interferes in fringes no finer than lambda / (2 alpha): there the speckle stays at its size at z0.
