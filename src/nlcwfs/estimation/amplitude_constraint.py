@@ -23,6 +23,7 @@ def modulus_factor(
     method: Literal["poisson", "replace"],
     read_variance: float | Float[Array, ""] = 0.0,
     doubt: float = 0.0,
+    mean: Float[Array, "plane 1 1"] | None = None,
 ) -> Float[Array, "plane y x"]:
     r"""By how much to multiply the model's light on each pixel.
 
@@ -40,6 +41,7 @@ def modulus_factor(
         read_variance: Variance of a pixel without light, in electrons squared.
         doubt: Relative variance of the model itself, while its phase is still coarse: bright speckles then
             weigh no more than faint ones. The step keeps its mean length, see `doubt_factor`.
+        mean: `mean_count`, when it is known already.
 
     Examples:
         >>> import jax.numpy as jnp
@@ -52,7 +54,7 @@ def modulus_factor(
         tiny = jnp.finfo(counts.dtype).tiny
         factor = jnp.sqrt(jnp.maximum(counts, 0) / jnp.maximum(model, tiny))
         return jnp.where(usable & (model > tiny), factor, 1)
-    mean = mean_count(counts, usable)
+    mean = mean_count(counts, usable) if mean is None else mean
     variance = (jnp.maximum(counts, 0) + model) / 2 + FLOOR * mean + read_variance
     variance = variance + doubt * (model + DARK_SHARE * mean) ** 2
     step = doubt_factor(mean, doubt) * (counts - model) / (2 * variance)

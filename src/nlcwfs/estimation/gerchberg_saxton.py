@@ -5,10 +5,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, modulus_factor
+from nlcwfs.estimation.angle import angle
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import blurred
@@ -31,28 +32,50 @@ class GerchbergSaxtonState(eqx.Module):
     iteration: Int[Array, ""]
 
 
+class PlaneGroup(NamedTuple):
+    """Planes that are taken together, and what was measured on them.
+
+    Attributes:
+        transfer: Fresnel factor from the pupil.
+        share: Weight of each plane in the mean of the returning light, sum 1.
+        counts: Photo-electrons; 0 where not usable.
+        usable: Which pixels were measured.
+        total: Sum of the counts.
+        mean: Mean count of the usable pixels.
+        blur: Fourier factor of the model's images, for the turbulence that is not modelled yet; None for none.
+    """
+
+    transfer: Complex[Array, "p y x"]
+    share: Float[Array, " p"]
+    counts: Float[Array, "p v u"]
+    usable: Bool[Array, "p v u"]
+    total: Float[Array, "p 1 1"]
+    mean: Float[Array, "p 1 1"]
+    blur: Float[Array, "p v fu"] | None
+
+
 class Problem(NamedTuple):
     """One measurement at one resolution.
 
     Attributes:
         level: The sensor.
-        measurement: The counts.
+        groups: All planes at once, or one after the other.
+        read_variance: Variance of a pixel without light, electrons squared.
         reference_rad: Phase that is added and never smoothed: starting tilt and static aberration.
         power: Expected power of the phase up to the present cutoff, see `turbulence_filter`.
         noise: Variance of the phase of a fully lit pixel after a step, rad^2, for the filter.
         gain: Length of a step.
         low_pass: Factor on the spectrum of the returning light; None without that filter.
-        blur: Fourier factor of the model's images, for the turbulence that is not modelled yet; None for none.
     """
 
     level: Level
-    measurement: Measurement
+    groups: list[PlaneGroup]
+    read_variance: Float[Array, ""]
     reference_rad: Float[Array, "y x"]
     power: Float[Array, "y fx"]
     noise: Float[Array, ""]
     gain: Float[Array, ""]
     low_pass: Float[Array, "y x"] | None
-    blur: Float[Array, "plane v fu"] | None
 
 
 def init(phase_rad: Float[Array, "y x"]) -> GerchbergSaxtonState:
@@ -68,18 +91,14 @@ def step(problem: Problem, settings: GerchbergSaxtonSettings, state: GerchbergSa
     (`averaged`) or one after the other (`serial`): light to the plane, modulus towards the measured one, light
     back; the pupil's modulus is put back by keeping the phase only.
     """
-    planes = problem.measurement.counts.shape[0]
-    phase_rad = state.phase_rad + problem.level.fast_forward * (state.phase_rad - state.previous_rad)
-    if settings.scheme == "averaged":
-        phase_rad = _through_planes(problem, settings, phase_rad, jnp.arange(planes))
-    else:
-        phase_rad = jax.lax.fori_loop(
-            0, planes, lambda p, phase: _through_planes(problem, settings, phase, p[None]), phase_rad
-        )
-    light = problem.level.light
+    level = problem.level
+    phase_rad = state.phase_rad + level.fast_forward * (state.phase_rad - state.previous_rad)
+    for group in problem.groups:
+        phase_rad = _through_planes(problem, settings, phase_rad, group)
     moved = phase_rad - state.phase_rad
-    moved = moved - jnp.sum(light * moved) / jnp.sum(light)
-    change_rad = jnp.sqrt(jnp.sum(light * moved**2) / jnp.sum(light))
+    # Piston does not count. Both sums share one pass over the pixels.
+    mean, square = jnp.sum(level.weight * moved), jnp.sum(level.weight * moved**2)
+    change_rad = jnp.sqrt(jnp.maximum(square - mean**2, 0))
     return GerchbergSaxtonState(phase_rad, state.phase_rad, change_rad, state.iteration + 1)
 
 
@@ -93,68 +112,83 @@ def terminate(problem: Problem, state: GerchbergSaxtonState) -> Array:
 
 def pupil_light(level: Level, phase_rad: Float[Array, "y x"]) -> Complex[Array, "y x"]:
     """Light of unit power at the pupil with this phase."""
-    modulus = level.optics.pupil / jnp.sqrt(jnp.sum(level.optics.pupil**2))
-    return jax.lax.complex(modulus * jnp.cos(phase_rad), modulus * jnp.sin(phase_rad))
+    return jax.lax.complex(level.modulus * jnp.cos(phase_rad), level.modulus * jnp.sin(phase_rad))
 
 
-def modelled_counts(
-    level: Level, measurement: Measurement, far: Complex[Array, "plane y x"], planes: Int[Array, " p"]
-) -> Float[Array, "p v u"]:
+def plane_groups(
+    level: Level,
+    measurement: Measurement,
+    settings: GerchbergSaxtonSettings,
+    *,
+    blur: Float[Array, "plane v fu"] | None = None,
+) -> list[PlaneGroup]:
+    """The planes as the scheme takes them: `averaged` all at once, `serial` one by one."""
+    counts = jnp.where(measurement.usable, measurement.counts, 0)
+    planes = counts.shape[0]
+    at_once = planes if settings.scheme == "averaged" else 1
+    groups = []
+    for first in range(0, planes, at_once):
+        part = slice(first, first + at_once)
+        share = level.optics.flux_fractions[part]
+        groups.append(
+            PlaneGroup(
+                transfer=level.optics.transfer[0, part],
+                share=share / jnp.sum(share),
+                counts=counts[part],
+                usable=measurement.usable[part],
+                total=jnp.sum(counts[part], axis=(1, 2), keepdims=True),
+                mean=mean_count(counts[part], measurement.usable[part]),
+                blur=None if blur is None else blur[part],
+            )
+        )
+    return groups
+
+
+def modelled_counts(level: Level, group: PlaneGroup, far: Complex[Array, "p y x"]) -> Float[Array, "p v u"]:
     """The model's light on the measured pixels, in the photo-electrons of each plane."""
     seen = level.on_pixels(far.real**2 + far.imag**2)
-    usable = measurement.usable[planes]
-    total = jnp.sum(jnp.where(usable, measurement.counts[planes], 0), axis=(1, 2))
-    share = jnp.sum(jnp.where(usable, seen, 0), axis=(1, 2))
-    return seen * (total / jnp.maximum(share, jnp.finfo(seen.dtype).tiny))[:, None, None]
+    share = jnp.sum(jnp.where(group.usable, seen, 0), axis=(1, 2), keepdims=True)
+    return seen * (group.total / jnp.maximum(share, jnp.finfo(seen.dtype).tiny))
 
 
 def _through_planes(
-    problem: Problem,
-    settings: GerchbergSaxtonSettings,
-    phase_rad: Float[Array, "y x"],
-    planes: Int[Array, " p"],
+    problem: Problem, settings: GerchbergSaxtonSettings, phase_rad: Float[Array, "y x"], group: PlaneGroup
 ) -> Float[Array, "y x"]:
     """To some planes and back: the phase after the measured moduli have been imposed there."""
     level = problem.level
     near = pupil_light(level, phase_rad + problem.reference_rad)
-    transfer = level.optics.transfer[0][planes]
-    far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * transfer)
-    factor = _factor_on_pixels(problem, settings, far, planes)
-    share = level.optics.flux_fractions[planes]
-    spectra = jnp.fft.fft2(far * level.on_cells(factor).astype(far.dtype)) * jnp.conj(transfer)
-    spectrum = jnp.sum(spectra * (share / jnp.sum(share))[:, None, None].astype(far.dtype), axis=0)
+    far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * group.transfer)
+    factor = level.on_cells(_factor_on_pixels(problem, settings, far, group))
+    weighted = jnp.conj(group.transfer) * group.share[:, None, None].astype(far.dtype)
+    spectrum = jnp.sum(jnp.fft.fft2(far * factor.astype(far.dtype)) * weighted, axis=0)
     if problem.low_pass is not None:
         spectrum = spectrum * problem.low_pass.astype(far.dtype)
-    returned = jnp.fft.ifft2(spectrum)
-    turned_rad = jnp.angle(returned * jnp.conj(near)) * level.light
-    phase_rad = phase_rad + problem.gain * turned_rad
+    turned = jnp.fft.ifft2(spectrum) * jnp.conj(near)
+    phase_rad = phase_rad + problem.gain * level.light * angle(turned)
     if settings.filter != "turbulence":
         return phase_rad
     return smooth_like_turbulence(phase_rad, problem.power, problem.noise)
 
 
 def _factor_on_pixels(
-    problem: Problem,
-    settings: GerchbergSaxtonSettings,
-    far: Complex[Array, "p y x"],
-    planes: Int[Array, " p"],
+    problem: Problem, settings: GerchbergSaxtonSettings, far: Complex[Array, "p y x"], group: PlaneGroup
 ) -> Float[Array, "p v u"]:
     """By how much to multiply the light on the measured pixels."""
-    level, measurement = problem.level, problem.measurement
-    model = modelled_counts(level, measurement, far, planes)
-    if problem.blur is not None:
-        model = blurred(model, problem.blur[planes])
+    model = modelled_counts(problem.level, group, far)
+    if group.blur is not None:
+        model = blurred(model, group.blur)
     factor = modulus_factor(
-        measurement.counts[planes],
+        group.counts,
         model,
-        measurement.usable[planes],
+        group.usable,
         method=settings.amplitude,
-        read_variance=measurement.read_variance,
-        doubt=level.doubt,
+        read_variance=problem.read_variance,
+        doubt=problem.level.doubt,
+        mean=group.mean,
     )
-    if problem.blur is None:
+    if group.blur is None:
         return factor
-    return 1 + blurred(factor - 1, problem.blur[planes])
+    return 1 + blurred(factor - 1, group.blur)
 
 
 def phase_noise(level: Level, measurement: Measurement) -> Float[Array, ""]:

@@ -8,8 +8,9 @@ from jax import numpy as jnp
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.pupil import light_weights
 from nlcwfs.errors import SettingsError
-from nlcwfs.estimation.resolution_level import Level, lit_fraction
+from nlcwfs.estimation.resolution_level import Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import image_structures, smoothing_factor, unmodelled_variance
@@ -82,6 +83,7 @@ def _level(
     oversampling = 1 if coarse else settings.oversampling
     grid = measured.finer(oversampling)
     optics = geometry.model(grid, dtype=dtype)
+    pupil = np.asarray(optics.pupil, float)
     diameter_m, wavelength_m = geometry.pupil.diameter_m, geometry.wavelength_m
     limits_per_m = [cutoff / diameter_m for cutoff in cutoffs_cpa] if smooths else [None]
     power = [
@@ -106,7 +108,9 @@ def _level(
     smoothing = smoothing_factor(measured, radius_m=settings.smoothing_pixels * geometry.frame.pixel_m)
     return Level(
         optics=optics,
-        light=jnp.asarray(lit_fraction(np.asarray(optics.pupil)), dtype),
+        modulus=jnp.asarray(pupil / np.sqrt(np.sum(pupil**2)), dtype),
+        light=jnp.asarray(pupil**2 / np.max(pupil**2), dtype),
+        weight=jnp.asarray(light_weights(pupil), dtype),
         power=jnp.asarray(np.array(power), dtype),
         structures=jnp.asarray(np.array(structures), dtype) if smooths else None,
         beyond=jnp.asarray(beyond, dtype),

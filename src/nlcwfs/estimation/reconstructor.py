@@ -15,7 +15,7 @@ from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.ladder import build_ladder
 from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
-from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import SPEED
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
 from nlcwfs.estimation.turbulence_filter import expected_error
@@ -44,7 +44,8 @@ class GerchbergSaxton(eqx.Module):
     over frames (`jax.vmap`).
 
     Examples:
-        >>>         >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> from nlcwfs.beam.grid import Grid
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
         >>> geometry = SensorGeometry(
         ...     pupil=PupilShape(diameter_m=8.0),
         ...     frame=Grid((32, 32), pixel_m=0.36),
@@ -158,7 +159,7 @@ class GerchbergSaxton(eqx.Module):
 
         def one_cutoff(climb: Climb, cutoff: Int[Array, ""]) -> tuple[Climb, None]:
             power = level.power[cutoff]
-            problem = problem_at(level, measured, tilt_rad + static_rad, cutoff, climb.strength, low_pass)
+            problem = problem_at(level, measured, options, tilt_rad + static_rad, cutoff, climb.strength, low_pass)
             state = iterate(
                 lambda state: gs.step(problem, options, state),
                 lambda state: gs.terminate(problem, state),
@@ -214,10 +215,10 @@ class GerchbergSaxton(eqx.Module):
         level, wavelength_m = self.levels[-1], self.geometry.wavelength_m
         tilt_rad = tilt_phase(slope, level.grid, wavelength_m)
         static_rad = level.optics.static_opd_m * (2 * np.pi / wavelength_m)
-        planes = jnp.arange(measured.counts.shape[0])
+        everything = gs.plane_groups(level, measured, GerchbergSaxtonSettings(scheme="averaged"))[0]
         near = gs.pupil_light(level, climb.phase_rad + tilt_rad + static_rad)
-        far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * level.optics.transfer[0])
-        model = gs.modelled_counts(level, measured, far, planes)
+        far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * everything.transfer)
+        model = gs.modelled_counts(level, everything, far)
         misfit = fit_quality(measured, model)
         phase_rad = self._on_frame(climb.phase_rad + tilt_rad)
         if self.unwrapper is not None:
@@ -234,10 +235,10 @@ class GerchbergSaxton(eqx.Module):
             misfit=misfit,
             residual=jnp.stack([_cropped(plane, self.geometry.frame.shape) for plane in residual]),
             iterations=climb.iterations,
-            ffts=climb.ffts + planes.size + 1,
+            ffts=climb.ffts + measured.counts.shape[0] + 1,
             outcome_code=verdict(
                 misfit=misfit,
-                plane_counts=jnp.sum(jnp.where(measured.usable, measured.counts, 0), axis=(1, 2)),
+                plane_counts=everything.total.reshape(-1),
                 rests=climb.change_rad < level.tolerance_rad,
                 finite=jnp.all(jnp.isfinite(opd_m)),
             ),
@@ -271,6 +272,7 @@ class Climb(eqx.Module):
 def problem_at(
     level: Level,
     measured: Measurement,
+    options: GerchbergSaxtonSettings,
     reference_rad: Float[Array, "y x"],
     cutoff: Int[Array, ""],
     strength: Float[Array, ""],
@@ -282,8 +284,16 @@ def problem_at(
     blur = None
     if level.structures is not None and level.smoothing is not None:
         blur = level.smoothing[None] * jnp.exp(-0.5 * SPEED * strength * level.structures[cutoff])
-    noise = gain * gs.phase_noise(level, measured)
-    return gs.Problem(level, measured, reference_rad, level.power[cutoff] * strength, noise, gain, low_pass, blur)
+    return gs.Problem(
+        level=level,
+        groups=gs.plane_groups(level, measured, options, blur=blur),
+        read_variance=measured.read_variance,
+        reference_rad=reference_rad,
+        power=level.power[cutoff] * strength,
+        noise=gain * gs.phase_noise(level, measured),
+        gain=gain,
+        low_pass=low_pass,
+    )
 
 
 def _cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:

@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.beam.grid import Grid
@@ -55,7 +54,9 @@ class Level(eqx.Module):
 
     Attributes:
         optics: The sensor on the grid of the model.
+        modulus: Of light of unit power at the pupil.
         light: Light of each pixel over that of a fully lit one.
+        weight: Share of the light in each pixel, sum 1.
         power: Expected power of the phase, one filter for each cutoff.
         structures: For each cutoff, plane and wave of the images, the structure function of the phase beyond the
             cutoff (rad^2, see `speckle_blur`); None where everything is modelled.
@@ -72,7 +73,9 @@ class Level(eqx.Module):
     """
 
     optics: CurvatureSensor
+    modulus: Float[Array, "y x"]
     light: Float[Array, "y x"]
+    weight: Float[Array, "y x"]
     power: Float[Array, "cutoff y fx"]
     structures: Float[Array, "cutoff plane v fu"] | None
     beyond: Float[Array, " cutoff"]
@@ -125,11 +128,6 @@ def resample_phase(phase_rad: Float[Array, "y x"], shape: tuple[int, int], *, wr
     cosine = jax.image.resize(jnp.cos(phase_rad), shape, method="linear")
     sine = jax.image.resize(jnp.sin(phase_rad), shape, method="linear")
     return jnp.arctan2(sine, cosine).astype(phase_rad.dtype)
-
-
-def lit_fraction(pupil: Float[np.ndarray, "y x"]) -> Float[np.ndarray, "y x"]:
-    """Light of each pixel over that of a fully lit one."""
-    return np.asarray(pupil) ** 2 / np.max(np.asarray(pupil) ** 2)
 
 
 def _sum_of_neighbours(array: Float[Array, "plane y x"]) -> Float[Array, "plane y x"]:
