@@ -1,0 +1,132 @@
+"""The command line: what may be typed; what it does is in `nlcwfs.commands`.
+
+Modules that need JAX are imported inside the commands, so that the help comes at once.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nlcwfs.commands.console import mendable
+
+app = typer.Typer(
+    name="nlcwfs",
+    help="The toolkit of the non-linear curvature wavefront sensor: from defocused pupil images to a wavefront. "
+    "New here? Type: nlcwfs demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit codes: 0 done; 1 done, but a wavefront is not to be believed (written and flagged); 2 something "
+    "that you can mend, told in one line; 130 interrupted, what was done is kept.",
+)
+
+ConfigArgument = Annotated[
+    Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Settings; what it leaves out is default.")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, such as beam.diameter_m=6.5; repeatable."),
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+SeedOption = Annotated[int | None, typer.Option(help="Which sky and noise; the same seed, the same numbers.")]
+
+
+@app.command()
+@mendable
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the files; made if it is not there.")] = Path("demo"),
+    seed: SeedOption = None,
+) -> None:
+    """Simulate a star through an 8 m telescope, reconstruct its wavefront, and draw it: about a minute."""
+    from nlcwfs.commands.demo import run_demo
+
+    raise typer.Exit(run_demo(out, seed=seed or 0))
+
+
+@app.command()
+@mendable
+def simulate(
+    config: ConfigArgument = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="FITS file to write.")] = Path("frames.fits"),
+    frames: Annotated[int | None, typer.Option(help="How many exposures, each of another sky.")] = None,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+    adu: Annotated[bool, typer.Option("--adu", help="Write readings (bias removed) instead of electrons.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate frames of a star, with the true wavefront beside them.
+
+    The light travels on a finer and wider grid than any reconstructor's model.
+    """
+    from nlcwfs.commands.simulate import SimulateOptions, read_config
+    from nlcwfs.commands.simulate import simulate as run
+
+    run(read_config(config, settings or [], frames=frames, seed=seed), SimulateOptions(out, adu, quiet))
+
+
+@app.command()
+@mendable
+def reconstruct(
+    frames: Annotated[
+        Path, typer.Argument(metavar="FRAMES.fits", help="Frames (plane, y, x) or (frame, plane, y, x).")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="FITS file to write.")] = Path("wavefront.fits"),
+    plot: Annotated[Path | None, typer.Option(metavar="PICTURE.png", help="Draw frames and wavefront, too.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings, of which [estimation] counts.")
+    ] = None,
+    settings: SetOption = None,
+    method: Annotated[str | None, typer.Option(help="How: gerchberg-saxton.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on after an interruption, with the same --out.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Reconstruct the wavefront behind the frames of a sensor.
+
+    Telescope, planes and pixels are read from the header. Each frame is an exposure of its own. Ctrl-C keeps what is
+    done.
+    """
+    from nlcwfs.commands.reconstruct import ReconstructOptions, read_estimation
+    from nlcwfs.commands.reconstruct import reconstruct as run
+
+    chosen = read_estimation(config, settings or [], method)
+    raise typer.Exit(run(chosen, ReconstructOptions(frames, out, plot, resume, quiet)).exit_code)
+
+
+@app.command()
+@mendable
+def config(
+    check: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Only say whether a file is good.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write the settings to a file.")] = None,
+) -> None:
+    """Print every setting with its default and its meaning, as a file to start from."""
+    from nlcwfs.commands.config_file import check_config, print_config
+
+    if check is not None:
+        check_config(check)
+    else:
+        print_config(out)
+
+
+@app.command()
+@mendable
+def figure(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="single-frame: the paper's eight panels.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Picture to write; default NAME.png.")] = None,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+) -> None:
+    """Draw a figure of Guyon (2010) with our numbers."""
+    from nlcwfs.commands.figure import draw_figure
+
+    draw_figure(name, out, seed=seed, overrides=settings or [])
+
+
+def main() -> None:
+    """Entry point of the command `nlcwfs`."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""What a command says, and where: results on stdout, warnings, errors and progress on stderr."""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+import typer
+
+from nlcwfs.errors import NlcwfsError
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells know it: 128 + SIGINT."""
+
+NOT_A_SUCCESS = 1
+USER_CAN_MEND = 2
+
+Parameters = ParamSpec("Parameters")
+Item = TypeVar("Item")
+
+
+def say(line: str, *, quiet: bool = False) -> None:
+    """A line of the result."""
+    if not quiet:
+        typer.echo(line)
+
+
+def warn(line: str) -> None:
+    """A line that the user should read even when the results go elsewhere."""
+    typer.echo(f"warning: {line}", err=True)
+
+
+def complain(line: str) -> None:
+    """A line about what went wrong."""
+    typer.echo(f"nlcwfs: {line}", err=True)
+
+
+def mendable(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
+    """Turn what the user can mend into one line for each problem and exit code 2; other errors stay tracebacks."""
+
+    @functools.wraps(command)
+    def checked(*arguments: Parameters.args, **options: Parameters.kwargs) -> None:
+        try:
+            command(*arguments, **options)
+        except NlcwfsError as error:
+            for line in str(error).splitlines():
+                complain(line)
+            raise typer.Exit(USER_CAN_MEND) from None
+        except KeyboardInterrupt:
+            complain("interrupted: nothing was written")
+            raise typer.Exit(INTERRUPTED) from None
+
+    return checked
+
+
+@contextmanager
+def working(what: str, *, quiet: bool = False) -> Iterator[None]:
+    """Show that something takes its time; nothing when stderr is not a terminal."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield
+
+
+def tracked(items: Iterable[Item], *, what: str, total: int, quiet: bool = False) -> Iterator[Item]:
+    """The items, with a bar and the time that is left; without a bar when stderr is not a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TextColumn("ETA"), TimeRemainingColumn())
+    silent = quiet or not console.is_terminal or total < 2
+    with Progress(*columns, console=console, disable=silent, transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        for item in items:
+            yield item
+            progress.advance(task)
+
+
+def use_precision(precision: str) -> str:
+    """Let JAX compute in 64 bits if that is asked for; returns the dtype to ask for."""
+    if precision == "double":
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        return "float64"
+    return "float32"
+
+
+def device() -> str:
+    """Where it is computed, in words."""
+    import jax
+
+    return str(jax.devices()[0])
+
+
+def percent(fraction: float) -> str:
+    """A share for the eye.
+
+    Examples:
+        >>> percent(0.0421), percent(0.31), percent(2e-5)
+        ('4.2 %', '31 %', 'less than 0.1 %')
+    """
+    if fraction < 1e-3:
+        return "less than 0.1 %"
+    return f"{100 * fraction:.2g} %"
