@@ -57,6 +57,8 @@ def modulus_factor(
     mean = mean_count(counts, usable) if mean is None else mean
     variance = (jnp.maximum(counts, 0) + model) / 2 + FLOOR * mean + read_variance
     variance = variance + doubt * (model + DARK_SHARE * mean) ** 2
+    # A dark plane has no variance at all, and nothing to say.
+    variance = jnp.maximum(variance, jnp.finfo(counts.dtype).tiny)
     step = doubt_factor(mean, doubt) * (counts - model) / (2 * variance)
     return jnp.where(usable, jnp.clip(1 + step, 0, LARGEST_FACTOR), 1)
 

@@ -9,11 +9,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, modulus_factor
-from nlcwfs.estimation.angle import angle
+from nlcwfs.estimation.angle import angle, cosine_and_sine, wrap
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import blurred
-from nlcwfs.estimation.turbulence_filter import smooth_like_turbulence
+from nlcwfs.estimation.turbulence_filter import smoothed_phase
 
 
 class GerchbergSaxtonState(eqx.Module):
@@ -62,8 +62,7 @@ class Problem(NamedTuple):
         groups: All planes at once, or one after the other.
         read_variance: Variance of a pixel without light, electrons squared.
         reference_rad: Phase that is added and never smoothed: starting tilt and static aberration.
-        power: Expected power of the phase up to the present cutoff, see `turbulence_filter`.
-        noise: Variance of the phase of a fully lit pixel after a step, rad^2, for the filter.
+        kept: Share of each wave that the filter keeps, see `turbulence_filter`.
         gain: Length of a step.
         low_pass: Factor on the spectrum of the returning light; None without that filter.
     """
@@ -72,8 +71,7 @@ class Problem(NamedTuple):
     groups: list[PlaneGroup]
     read_variance: Float[Array, ""]
     reference_rad: Float[Array, "y x"]
-    power: Float[Array, "y fx"]
-    noise: Float[Array, ""]
+    kept: Float[Array, "y fx"]
     gain: Float[Array, ""]
     low_pass: Float[Array, "y x"] | None
 
@@ -112,7 +110,8 @@ def terminate(problem: Problem, state: GerchbergSaxtonState) -> Array:
 
 def pupil_light(level: Level, phase_rad: Float[Array, "y x"]) -> Complex[Array, "y x"]:
     """Light of unit power at the pupil with this phase."""
-    return jax.lax.complex(level.modulus * jnp.cos(phase_rad), level.modulus * jnp.sin(phase_rad))
+    cosine, sine = cosine_and_sine(phase_rad)
+    return jax.lax.complex(level.modulus * cosine, level.modulus * sine)
 
 
 def plane_groups(
@@ -156,18 +155,20 @@ def _through_planes(
 ) -> Float[Array, "y x"]:
     """To some planes and back: the phase after the measured moduli have been imposed there."""
     level = problem.level
-    near = pupil_light(level, phase_rad + problem.reference_rad)
+    whole_rad = phase_rad + problem.reference_rad
+    near = pupil_light(level, whole_rad)
     far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * group.transfer)
     factor = level.on_cells(_factor_on_pixels(problem, settings, far, group))
     weighted = jnp.conj(group.transfer) * group.share[:, None, None].astype(far.dtype)
     spectrum = jnp.sum(jnp.fft.fft2(far * factor.astype(far.dtype)) * weighted, axis=0)
     if problem.low_pass is not None:
         spectrum = spectrum * problem.low_pass.astype(far.dtype)
-    turned = jnp.fft.ifft2(spectrum) * jnp.conj(near)
-    phase_rad = phase_rad + problem.gain * level.light * angle(turned)
+    # Not the angle of a product with `near`: the compiler would compute its sines and cosines twice.
+    turned_rad = wrap(angle(jnp.fft.ifft2(spectrum)) - whole_rad)
+    phase_rad = phase_rad + problem.gain * level.light * turned_rad
     if settings.filter != "turbulence":
         return phase_rad
-    return smooth_like_turbulence(phase_rad, problem.power, problem.noise)
+    return smoothed_phase(phase_rad, problem.kept)
 
 
 def _factor_on_pixels(

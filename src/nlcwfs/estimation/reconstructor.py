@@ -18,7 +18,7 @@ from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import SPEED
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
-from nlcwfs.estimation.turbulence_filter import expected_error
+from nlcwfs.estimation.turbulence_filter import expected_error, wiener_filter
 from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
 from nlcwfs.estimation.unwrapping import SlopeUnwrapper
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
@@ -289,8 +289,7 @@ def problem_at(
         groups=gs.plane_groups(level, measured, options, blur=blur),
         read_variance=measured.read_variance,
         reference_rad=reference_rad,
-        power=level.power[cutoff] * strength,
-        noise=gain * gs.phase_noise(level, measured),
+        kept=wiener_filter(level.power[cutoff] * strength, gain * gs.phase_noise(level, measured)),
         gain=gain,
         low_pass=low_pass,
     )

@@ -42,22 +42,20 @@ def expected_power(
     return power
 
 
-def smooth_like_turbulence(
-    phase_rad: Float[Array, "y x"],
-    power: Float[Array, "y fx"],
-    noise_variance: float | Float[Array, ""],
-) -> Float[Array, "y x"]:
-    """Wiener's filter: each wave is kept by `power / (power + noise_variance)`.
+def wiener_filter(power: Float[Array, "y fx"], noise_variance: float | Float[Array, ""]) -> Float[Array, "y fx"]:
+    """Share of each wave to keep: `power / (power + noise_variance)`.
 
     Args:
-        phase_rad: A phase that is not wrapped, on a periodic grid.
         power: See `expected_power`.
         noise_variance: Variance of white noise per pixel, rad^2.
     """
+    return power / (power + noise_variance)
+
+
+def smoothed_phase(phase_rad: Float[Array, "y x"], kept: Float[Array, "y fx"]) -> Float[Array, "y x"]:
+    """A phase that is not wrapped, on a periodic grid, with each wave multiplied by the share to keep."""
     spectrum = jnp.fft.rfft2(phase_rad)
-    kept = power / (power + noise_variance)
-    filtered = jnp.fft.irfft2(spectrum * kept.astype(spectrum.dtype), s=phase_rad.shape)
-    return filtered.astype(phase_rad.dtype)
+    return jnp.fft.irfft2(spectrum * kept.astype(spectrum.dtype), s=phase_rad.shape).astype(phase_rad.dtype)
 
 
 def expected_error(power: Float[Array, "y fx"], noise_variance: Float[Array, ""], grid: Grid) -> Float[Array, ""]:

@@ -7,6 +7,7 @@ import scipy.ndimage
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.estimation.angle import wrap
 
 WEAKEST_DIRECTION = 1e-3
 """Combinations of modes whose slopes are this much weaker than the strongest are left to the remainder."""
@@ -111,14 +112,3 @@ class SlopeUnwrapper(eqx.Module):
         """The unwrapped phase, as a sum of modes; each pixel outside the pupil shows its nearest lit one."""
         lit_rad = self.coefficients(wrapped_rad) @ self.modes
         return lit_rad[self.nearest].astype(wrapped_rad.dtype)
-
-
-def wrap(phase_rad: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Bring a phase into -pi..pi by whole turns.
-
-    Examples:
-        >>> import jax.numpy as jnp
-        >>> round(float(wrap(jnp.asarray(7.0))), 4)
-        0.7168
-    """
-    return phase_rad - 2 * np.pi * jnp.round(phase_rad / (2 * np.pi))
