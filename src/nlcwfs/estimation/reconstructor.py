@@ -125,6 +125,7 @@ class GerchbergSaxton(eqx.Module):
         dtype = self.first_strength.dtype
         measured = Measurement(counts.astype(dtype), usable, jnp.asarray(read_variance, dtype))
         measured = measured.padded(self.levels[-1].measured_shape)
+        start_m = None if start_m is None else start_m.astype(dtype)
         slope = self._starting_slope(measured, start_m)
         climb = Climb(
             phase_rad=self._starting_phase(start_m, slope),
