@@ -32,7 +32,6 @@ FIRST_STRENGTH_AT_FRIED = 0.1
 SENSOR_LOSS = 2.0
 """A sensor of speckles needs about twice the photons of the quantum limit, 1 / (4 N) rad^2 (study 01)."""
 
-
 LARGEST_BEYOND = 3.0
 """Unmodelled variance (rad^2) beyond which steps grow no further."""
 
@@ -147,6 +146,7 @@ class GerchbergSaxton(eqx.Module):
         weights = jnp.asarray(slope_weights(level.grid), tilt_rad.dtype)
         noise = SENSOR_LOSS * gs.phase_noise(level, measured)
         learns = self.measures_strength and carried and level is not self.levels[-1]
+        planes = measured.counts.shape[0]
 
         low_pass = None
         if options.filter == "low-pass":
@@ -157,6 +157,7 @@ class GerchbergSaxton(eqx.Module):
             )
         if level.smoothing is not None:
             measured = measured.smoothed(level.smoothing)
+            climb = eqx.tree_at(lambda c: c.ffts, climb, climb.ffts + planes)
 
         def one_cutoff(climb: Climb, cutoff: Int[Array, ""]) -> tuple[Climb, None]:
             power = level.power[cutoff]
@@ -170,9 +171,7 @@ class GerchbergSaxton(eqx.Module):
             if learns:
                 whole_rad = state.phase_rad + tilt_rad
                 strength = updated_strength(strength, whole_rad, level.light, power, weights, noise)
-            ffts = state.iteration * gs.ffts_per_iteration(
-                measured.counts.shape[0], options, blurs=level.structures is not None
-            )
+            ffts = state.iteration * gs.ffts_per_iteration(planes, options, blurs=level.structures is not None)
             climb = Climb(
                 state.phase_rad,
                 strength,
