@@ -15,20 +15,22 @@ from nlcwfs.beam.modes import modal_basis
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.estimation import gerchberg_saxton as gs
 from nlcwfs.estimation.amplitude_constraint import LARGEST_FACTOR, modulus_factor
-from nlcwfs.estimation.angle import angle
+from nlcwfs.estimation.angle import angle, cosine_and_sine, wrap
 from nlcwfs.estimation.centroid_tilt import centroid_tilt
 from nlcwfs.estimation.reconstructor import GerchbergSaxton, problem_at
 from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
-from nlcwfs.estimation.turbulence_filter import smooth_like_turbulence
+from nlcwfs.estimation.turbulence_filter import smoothed_phase, wiener_filter
 from nlcwfs.estimation.turbulence_strength import LARGEST_STEP, slope_weights, updated_strength
-from nlcwfs.estimation.unwrapping import SlopeUnwrapper, wrap
+from nlcwfs.estimation.unwrapping import SlopeUnwrapper
 
 WAVELENGTH_M = 0.65e-6
 PIXEL_M = 0.2
 ROUNDING = 1e-11  # a few FFTs of some hundred pixels in float64, for numbers of order 1
+
+ANGLE_ERROR = 1.2e-5  # of the polynomial for angles: Abramowitz & Stegun 1964, 4.4.47
 
 few = settings(max_examples=20, deadline=None)  # the first example of a shape compiles
 seeds = st.integers(0, 2**32 - 1)
@@ -183,8 +185,7 @@ def test_the_true_field_is_a_fixed_point(seed, shape, scheme):
     shares = np.array(SHARES)[:, None, None]
     counts = 1e4 * shares * abs(seen_by_numpy(pupil, phase_rad, 3)) ** 2
     after = np.asarray(plain_step(shape, 3, scheme)(pupil, counts, phase_rad, 1.0))
-    # 1e-7: a dark pixel of a plane is known to the root of the rounding of its intensity.
-    np.testing.assert_allclose(after, phase_rad, atol=1e-7)
+    np.testing.assert_allclose(after, phase_rad, atol=3 * ANGLE_ERROR)  # serial turns the phase three times
 
 
 @few
@@ -221,7 +222,7 @@ def test_the_amplitude_misfit_never_grows(seed, shape, planes, gain, photons):
     for _ in range(4):
         phase_rad = np.asarray(step(pupil, counts, phase_rad, gain))
         values.append(misfit(phase_rad))
-    assert np.all(np.diff(values) <= 1e-12)
+    assert np.all(np.diff(values) <= 1e-9)  # the phase is wrong by 1e-5 rad, its square counts
     assert values[-1] < values[0]
 
 
@@ -241,8 +242,17 @@ def test_with_one_plane_serial_and_averaged_are_the_same(seed, shape):
 def test_angles_are_those_of_the_arctangent(seed, size):
     rng = numbers(seed)
     complex_ = size * np.r_[rng.normal(size=40) + 1j * rng.normal(size=40), 1, 1j, -1j, -1 + 1e-9j, 1 - 1e-9j, 1 + 1j]
-    np.testing.assert_allclose(angle(jnp.asarray(complex_)), np.angle(complex_), atol=1.2e-5)  # Abramowitz & Stegun
+    np.testing.assert_allclose(angle(jnp.asarray(complex_)), np.angle(complex_), atol=ANGLE_ERROR)
     assert float(angle(jnp.zeros(1, complex))[0]) == 0  # a pixel without light does not move
+
+
+@few
+@given(seed=seeds, size=st.floats(1e-3, 1e3))
+def test_fast_waves_are_cosine_and_sine(seed, size):
+    phase_rad = np.r_[size * numbers(seed).normal(size=50), np.arange(-8, 9) * np.pi / 4]
+    cosine, sine = cosine_and_sine(jnp.asarray(phase_rad))
+    np.testing.assert_allclose(cosine, np.cos(phase_rad), atol=3e-9)  # Abramowitz & Stegun, 4.3.97 and 4.3.99
+    np.testing.assert_allclose(sine, np.sin(phase_rad), atol=3e-9)
 
 
 # ------------------------------------------------------------------------------------ turbulence filter
@@ -257,7 +267,7 @@ def random_power(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray
 
 def smoothed(phase_rad, power, noise) -> np.ndarray:
     half = jnp.asarray(power[:, : power.shape[1] // 2 + 1])
-    return np.asarray(smooth_like_turbulence(jnp.asarray(phase_rad), half, noise))
+    return np.asarray(smoothed_phase(jnp.asarray(phase_rad), wiener_filter(half, noise)))
 
 
 @few
