@@ -1,5 +1,6 @@
 """How Sphinx builds these pages; a warning is an error, and nothing is fetched from the network."""
 
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import include_study  # noqa: E402  (it stands beside this file)
+import generated_parts  # noqa: E402  (it stands beside this file)
 
 project = "nlcwfs"
 author = "The nlcwfs developers"
@@ -28,7 +29,7 @@ default_role = "code"  # a single backtick in a docstring is code
 nitpicky = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
@@ -36,21 +37,18 @@ toc_object_entries_show_parents = "hide"
 napoleon_use_ivar = True
 
 
-def _short_shapes(app, what, name, obj, options, signature, returns):
-    """`Float[Array, 'y x']` reads better than the classes behind it."""
+def _short(text):
+    """`Float[Array, 'y x']` reads better than the modules that its parts live in."""
+    return (
+        re.sub(r"~?\b(?:jaxtyping|jaxlib\._jax|jaxlib\._|jax|numpy|typing)\.?(?=[A-Z]|ndarray)", "", text)
+        if text
+        else text
+    )
 
-    def short(text):
-        for long, brief in (
-            ("jaxtyping.", ""),
-            ("jax.Array", "Array"),
-            ("jax._src.prng.", ""),
-            ("numpy.ndarray", "ndarray"),
-            ("~typing.", ""),
-        ):
-            text = text.replace(long, brief) if text else text
-        return text
 
-    return short(signature), short(returns)
+def _short_signatures(app, what, name, obj, options, signature, returns):
+    """The same for functions and classes."""
+    return _short(signature), _short(returns)
 
 
 def _literal_shapes(app, what, name, obj, options, lines):
@@ -58,11 +56,13 @@ def _literal_shapes(app, what, name, obj, options, lines):
     for number, line in enumerate(lines):
         field, _, text = line.rpartition(": ") if line.startswith(":vartype ") else ("", "", "")
         if field:
-            lines[number] = f"{field}: ``{text.replace('~', '')}``"
+            lines[number] = f"{field}: ``{_short(text)}``"
 
 
 def setup(app):
     """Called by Sphinx."""
-    include_study.write_pages(HERE)
+    generated_parts.write_pages(HERE)
+    generated_parts.write_settings(HERE)
+    generated_parts.write_command_line(HERE)
     app.connect("autodoc-process-docstring", _literal_shapes, priority=900)  # after napoleon
-    app.connect("autodoc-process-signature", _short_shapes)
+    app.connect("autodoc-process-signature", _short_signatures)

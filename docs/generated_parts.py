@@ -1,0 +1,62 @@
+"""Makes parts of the documentation out of studies and settings, so that each stands in one place only."""
+
+from pathlib import Path
+
+import typer
+from typer.testing import CliRunner
+
+from nlcwfs.cli import app
+from nlcwfs.config import default_toml
+
+STUDIES = ("01-single-frame",)
+PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
+
+
+def write_pages(docs: Path) -> None:
+    """Copy the README of each study, one heading level lower, to where a page of the docs includes it.
+
+    A study that is not stored yet becomes a sentence that says so. Pictures are left out: they stand in the
+    study's own folder.
+    """
+    for name in STUDIES:
+        readme = docs.parent / "studies" / name / "README.md"
+        text = _lowered(readme.read_text()) if readme.exists() else PENDING
+        _write(docs / "_generated" / f"study-{name}.md", text)
+
+
+def write_settings(docs: Path) -> None:
+    """Write every setting under its comment, and the part of it that rules the reconstruction."""
+    everything = default_toml()
+    _write(docs / "_generated" / "default.toml", everything)
+    blocks = everything.split("\n\n")
+    first = next(number for number, block in enumerate(blocks) if "\n[estimation]" in f"\n{block}")
+    last = next(number for number, block in enumerate(blocks) if "\n[simulation]" in f"\n{block}")
+    _write(docs / "_generated" / "estimation.toml", "\n\n".join(blocks[first:last]) + "\n")
+
+
+def write_command_line(docs: Path) -> None:
+    """Write the help of every command, as it is typed."""
+    wide = {"COLUMNS": "110", "TERMINAL_WIDTH": "110", "NO_COLOR": "1", "TERM": "dumb"}
+    parts = []
+    for name in ["", *typer.main.get_command(app).commands]:  # pyright: ignore
+        words = ["nlcwfs", name, "--help"] if name else ["nlcwfs", "--help"]
+        shown = CliRunner().invoke(app, words[1:], env=wide, prog_name="nlcwfs").output
+        body = "\n".join(line.rstrip() for line in shown.strip().splitlines())
+        parts.append(f"## `{' '.join(words[:-1])}`\n\n```text\n{body}\n```\n")
+    _write(docs / "_generated" / "command-line.md", "\n".join(parts))
+
+
+def _write(target: Path, text: str) -> None:
+    target.parent.mkdir(exist_ok=True)
+    if not target.exists() or target.read_text() != text:  # an unchanged page is not built again
+        target.write_text(text)
+
+
+def _lowered(text: str) -> str:
+    lines, in_code = [], False
+    for line in text.splitlines():
+        in_code ^= line.startswith("```")
+        if line.startswith("![") and not in_code:
+            continue
+        lines.append(f"#{line}" if line.startswith("#") and not in_code else line)
+    return "\n".join(lines) + "\n"
