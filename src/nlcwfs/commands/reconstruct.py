@@ -190,7 +190,7 @@ def run(reconstructor: FramesReconstructor, done: dict[int, FrameWavefront], *, 
 def light_lost(reconstructor: FramesReconstructor, done: dict[int, FrameWavefront]) -> np.ndarray | None:
     """Share of the light of each plane that misses the window, mean over the first successes."""
     good = [each.opd_m for each in done.values() if is_success(each.outcome)][:10]
-    return np.mean([reconstructor.light_outside(opd_m) for opd_m in good], axis=0) if good else None
+    return reconstructor.light_outside(good) if good else None
 
 
 def header_lines(frames: FramesFile, reconstructor: FramesReconstructor, *, already: int) -> list[str]:
@@ -200,7 +200,8 @@ def header_lines(frames: FramesFile, reconstructor: FramesReconstructor, *, alre
     electrons = np.median(reconstructor.photo_electrons[usable].sum(axis=(1, 2, 3)))
     masked = int(frames.masked.sum())
     seeing = reconstructor.settings.seeing_arcsec
-    prior = "measured from the frames" if seeing is None else f"seeing {seeing:.2g} arcsec"
+    source = "SEEING of the header" if seeing == frames.seeing_arcsec else "estimation.seeing_arcsec"
+    prior = "measured from each frame" if seeing is None else f"seeing {seeing:.2g} arcsec ({source})"
     return [
         f"Frames: {count} of {planes} planes of {rows} x {columns} pixels, {frames.diameter_m / frames.pixel_m:.3g} "
         f"across the pupil; {electrons:.0f} electrons in a frame{f', {masked} pixels masked' if masked else ''}.",
@@ -214,7 +215,7 @@ def result_lines(wavefront: WavefrontFile, lost: np.ndarray | None) -> list[str]
     lines = []
     if lost is not None:
         shares = ", ".join(percent(float(share)) for share in lost)
-        lines.append(f"Light outside the window: about {shares} of planes 1 to {len(lost)}, by the wavefront found.")
+        lines.append(f"Light outside the window: about {shares} of planes 1 to {len(lost)}.")
     numbers = range(len(wavefront.outcomes))
     failed = [number for number in numbers if not is_success(wavefront.outcomes[number])]
     several = len(numbers) > FEW_FRAMES

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,10 +11,12 @@ import numpy as np
 import scipy.fft
 from jaxtyping import Array, Bool, Float
 
+from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis, modal_basis
 from nlcwfs.beam.pupil import inside, light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
+from nlcwfs.beam.sampling_cost import SensedLight, light_outside
 from nlcwfs.beam.zernike import ZernikeFit, zernike_fit, zernikes
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
 from nlcwfs.detector.pixels import fraction_outside_window
@@ -154,9 +157,23 @@ class FramesReconstructor(eqx.Module):
         light = light_weights(pupil_on_frame(self.geometry))[lit]
         return one_mode_m * np.sqrt(np.sum(matrix[:, lit] ** 2 / light, axis=1))  # 1 each on a full disc
 
-    def light_outside(self, opd_m: Float[np.ndarray, "y x"]) -> Float[np.ndarray, " plane"]:
-        """Share of the light of each plane that misses the window of the frames, if this is the wavefront."""
-        return np.asarray(_light_outside(self.wide, np.nan_to_num(opd_m), self.geometry.frame.shape))
+    def light_outside(self, opds_m: Sequence[Float[np.ndarray, "y x"]]) -> Float[np.ndarray, " plane"]:
+        """Share of the light of each plane that misses the window of the frames.
+
+        The larger of two estimates: by these wavefronts, which hold the tilt but not the finest waves, and by
+        the mean over turbulence as strong as theirs, which holds both on average.
+        """
+        shape, diameter_m = self.geometry.frame.shape, self.geometry.pupil.diameter_m
+        found = np.mean([_light_outside(self.wide, np.nan_to_num(opd_m), shape) for opd_m in opds_m], axis=0)
+        rms = max(float(np.mean([rms_m(opd_m, self.weights) for opd_m in opds_m])), 1e-12)
+        air = Turbulence.from_rms(opd_rms_m=rms, diameter_m=diameter_m)
+        if self.settings.seeing_arcsec is not None:
+            air = Turbulence.from_seeing(seeing_arcsec=self.settings.seeing_arcsec)
+        wavelength_m = self.geometry.wavelength_m
+        light = SensedLight(diameter_m, wavelength_m, fried_m=air.fried_at(wavelength_m))
+        window_m = min(self.geometry.frame.width_m)
+        usual = [light_outside(light, distance_m=z, window_m=window_m) if z else 0.0 for z in self.geometry.distances_m]
+        return np.maximum(found, usual)
 
     def _estimate(self, number: int) -> WavefrontEstimate:
         dtype = self.solver.first_strength.dtype
@@ -270,9 +287,10 @@ def _wide_grid(geometry: SensorGeometry) -> Grid:
 
 def _light_outside(
     wide: CurvatureSensor, opd_m: Float[np.ndarray, "y x"], window: tuple[int, int]
-) -> Float[Array, " plane"]:
-    whole = jnp.asarray(centred_in(opd_m, wide.pupil.shape), wide.pupil.dtype)
-    return _fraction_outside(wide, whole, window)
+) -> Float[np.ndarray, " plane"]:
+    rows, columns = wide.pupil.shape
+    whole = jnp.asarray(centred_in(opd_m, (rows, columns)), wide.pupil.dtype)
+    return np.asarray(_fraction_outside(wide, whole, window), float)
 
 
 @eqx.filter_jit

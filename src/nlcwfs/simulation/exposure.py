@@ -101,7 +101,7 @@ class ExposureSimulator(eqx.Module):
         light = light_grid(config)
         pupil = shape.on(light)
         cut = _lit_part(pupil)
-        window = (config.detector.window_pixels,) * 2
+        window = (config.detector.window_pixels, config.detector.window_pixels)
         weights = light_weights(pupil)
         return cls(
             shape=shape,
