@@ -143,10 +143,10 @@ def check_sampling(
         if pixel_m > plane.pixel_m * (1 + 1e-6):
             kept, wanted = float(np.sinc(pixel_m / plane.speckle_m)), float(np.sinc(0.5))
             sentence = (
-                f"{at} pixels of {pixel_m:.3f} m leave {max(kept, 0):.0%} of the contrast of the finest"
+                f"{at} pixels of {pixel_m:.3f} m leave {max(kept, 0.0):.0%} of the contrast of the finest"
                 f" speckles; {plane.pixel_m:.3f} m leave {wanted:.0%}."
             )
-            warnings.append(SamplingWarning(_spaced(sentence), plane.distance_m, 1 - max(kept, 0)))
+            warnings.append(SamplingWarning(_spaced(sentence), plane.distance_m, 1 - max(kept, 0.0)))
         lost, wrapped = window_costs(light, distance_m=plane.distance_m, window_m=window_m)
         if lost > LOSS_WORTH_A_WORD:
             sentence = (
