@@ -288,11 +288,7 @@ def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: G
 
 
 def _lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
-    """The smallest part of a grid that holds all the light and has the grid's centre.
-
-    Raises:
-        SamplingError: If there is no light.
-    """
+    """The smallest part of a grid that holds all the light, of which there must be some, and has its centre."""
     slices = []
     for size, lit in zip(pupil.shape, (pupil.any(axis=1), pupil.any(axis=0)), strict=True):
         index = np.flatnonzero(lit)
