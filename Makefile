@@ -42,7 +42,7 @@ bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own 
 	$(BIN)/python bench/gerchberg_saxton.py
 
 clean:  ## Back to a fresh clone, but for changes of yours
-	rm -rf $(VENV) docs/_build demo dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) docs/_build docs/_generated demo dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
