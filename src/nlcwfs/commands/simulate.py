@@ -91,7 +91,8 @@ def sampling_warnings(config: Config, light: SensedLight) -> list[str]:
     Raises:
         SettingsError: If no wavefront could be found with these pixels.
     """
-    detector, distances = config.detector, distances_m(config)
+    detector = config.detector
+    distances = sorted({abs(distance_m) for distance_m in distances_m(config)})  # both sides of the pupil cost alike
     pixel_m = config.beam.diameter_m / detector.pixels_across_pupil
     window_m = detector.window_pixels * pixel_m
     try:
@@ -100,19 +101,13 @@ def sampling_warnings(config: Config, light: SensedLight) -> list[str]:
         rule = str(error).partition(", got ")[0].replace(": ", " ", 1)
         got = f"{detector.pixels_across_pupil} ({pixel_m:.3g} m each)"
         raise SettingsError("detector.pixels_across_pupil", f"must suit the light, {rule}", got) from None
-    sentences = [_for_both_sides(str(warning)) for warning in found]
-    farthest_m = max(distances, key=abs)
+    sentences = [str(warning) for warning in found]
     wide_m = window_m * config.simulation.light_window
-    lost = light_outside(light, distance_m=farthest_m, window_m=wide_m)
+    lost = light_outside(light, distance_m=distances[-1], window_m=wide_m)
     if lost > LOSS_WORTH_A_WORD:
         rest = "comes back in on the other side; raise simulation.light_window"
         sentences.append(f"{percent(lost)} of the light leaves the simulated window of {wide_m:.3g} m and {rest}.")
-    return list(dict.fromkeys(sentences))
-
-
-def _for_both_sides(sentence: str) -> str:
-    """What is said of a plane holds for its twin on the other side of the pupil."""
-    return sentence.replace("At -", "At +-", 1) if sentence.startswith("At -") else sentence.replace("At ", "At +-", 1)
+    return sentences
 
 
 def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot], frames: FramesFile) -> list[str]:

@@ -28,8 +28,9 @@ from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_file import FramesFile
 from nlcwfs.interop.wavefront_file import FrameWavefront
 
-WELL_SEEN = 10.0
-"""Zernikes are listed as long as noise in the worst combination of them is below ten times that in the best."""
+WELL_SEEN = 2.0
+"""Zernikes are listed as long as noise in the worst combination of them is below twice that in the best: beyond, even
+tilt takes up noise from the last ones, because all are fitted together."""
 
 MOST_ZERNIKES = 800
 """More are in no optician's table; the wavefront itself holds them all."""
@@ -91,7 +92,7 @@ class FramesReconstructor(eqx.Module):
         if settings.seeing_arcsec is None and frames.seeing_arcsec is not None:
             settings = settings.model_copy(update={"seeing_arcsec": frames.seeing_arcsec})
         geometry = sensor_geometry(frames)
-        pupil = pupil_on_frame(geometry)
+        pupil = scored_pupil(geometry)
         basis = _basis(pupil, geometry, settings) if settings.unwrapping == "slopes" else None
         background = 0.0 if frames.background is None else float(np.mean(frames.background))
         return cls(
@@ -100,7 +101,7 @@ class FramesReconstructor(eqx.Module):
             geometry=geometry,
             photo_electrons=frames.photo_electrons(),
             solver=GerchbergSaxton.build(geometry, settings, basis=basis, dtype=dtype),
-            weights=light_weights(np.where(inside(pupil), pupil, 0)),
+            weights=light_weights(pupil),
             fit=well_seen_zernikes(pupil, geometry, most=min(settings.modes, MOST_ZERNIKES)),
             wide=geometry.model(_wide_grid(geometry), dtype=dtype),
             read_variance=frames.read_noise_electrons**2 + frames.dark_electrons + max(background, 0.0),
@@ -154,7 +155,7 @@ class FramesReconstructor(eqx.Module):
         effective = electrons**2 / (electrons + int(known.sum()) * self.read_variance)
         one_mode_m = math.sqrt(SENSOR_LOSS) / (2 * math.sqrt(effective)) * self.geometry.wavelength_m / (2 * np.pi)
         matrix, lit = np.asarray(self.fit.matrix), np.asarray(self.fit.lit)
-        light = light_weights(pupil_on_frame(self.geometry))[lit]
+        light = self.weights[lit]
         return one_mode_m * np.sqrt(np.sum(matrix[:, lit] ** 2 / light, axis=1))  # 1 each on a full disc
 
     def light_outside(self, opds_m: Sequence[Float[np.ndarray, "y x"]]) -> Float[np.ndarray, " plane"]:
@@ -172,8 +173,9 @@ class FramesReconstructor(eqx.Module):
         wavelength_m = self.geometry.wavelength_m
         light = SensedLight(diameter_m, wavelength_m, fried_m=air.fried_at(wavelength_m))
         window_m = min(self.geometry.frame.width_m)
-        usual = [light_outside(light, distance_m=z, window_m=window_m) if z else 0.0 for z in self.geometry.distances_m]
-        return np.maximum(found, usual)
+        both_sides = {abs(distance_m) for distance_m in self.geometry.distances_m}
+        usual = {z: light_outside(light, distance_m=z, window_m=window_m) if z else 0.0 for z in both_sides}
+        return np.maximum(found, [usual[abs(distance_m)] for distance_m in self.geometry.distances_m])
 
     def _estimate(self, number: int) -> WavefrontEstimate:
         dtype = self.solver.first_strength.dtype
@@ -213,6 +215,12 @@ def pupil_on_frame(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
     margin = math.ceil(geometry.pupil.diameter_m / geometry.frame.pixel_m / 2)
     pupil = geometry.pupil.on(Grid((rows + 2 * margin, columns + 2 * margin), geometry.frame.pixel_m))
     return pupil[margin : margin + rows, margin : margin + columns]
+
+
+def scored_pupil(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
+    """The pupil on the pixels that count for a wavefront: those at least half lit."""
+    pupil = pupil_on_frame(geometry)
+    return np.where(inside(pupil), pupil, 0)
 
 
 def rms_m(opd_m: Float[np.ndarray, "y x"], weights: Float[np.ndarray, "y x"]) -> float:

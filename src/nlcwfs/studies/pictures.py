@@ -19,7 +19,7 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.interop.atomic_write import atomic_write
 from nlcwfs.interop.frames_file import FramesFile
-from nlcwfs.interop.frames_reconstruction import pupil_on_frame, rms_m, sensor_geometry
+from nlcwfs.interop.frames_reconstruction import pupil_on_frame, rms_m, scored_pupil, sensor_geometry
 from nlcwfs.interop.wavefront_file import WavefrontFile
 from nlcwfs.science.point_spread_function import point_spread_function, strehl_ratio
 from nlcwfs.studies.single_frame import PSF_PIXELS, PSF_WIDTH, SingleFrame
@@ -103,7 +103,7 @@ def draw_reconstruction(frames: FramesFile, wavefront: WavefrontFile, number: in
     error_m = error_m - np.nanmean(error_m)
     panel = board.panel(2, 2)
     image = _draw_pupil(panel, error_m * 1e9, width_m, ERROR, _limit(error_m * 1e9))
-    light = pupil_on_frame(sensor_geometry(frames)) ** 2
+    light = scored_pupil(sensor_geometry(frames)) ** 2
     _title(panel, f"({next(letters)}) residual, {rms_m(error_m, light) * 1e9:.1f} nm rms")
     board.bar(image, 2, 2, "true - found, nm")
     _draw_star(board, 3, "star after", error_m, frames, letters)
@@ -178,7 +178,7 @@ def _draw_frames(board: _Board, frames: FramesFile, number: int, letters: Iterat
     top = max(float(np.nanpercentile(counts, 99.7)), 1e-3)
     for column, (plane, distance_m) in enumerate(zip(counts, frames.distances_m, strict=True)):
         panel = board.panel(0, column)
-        image = _draw_plane(panel, plane, INTENSITY, 0, top)
+        image = _draw_plane(panel, plane, INTENSITY, 0.0, top)
         _title(panel, f"({next(letters)}) z = {_km(distance_m)}")
         _outline(panel, frames, "white")
         if column == 0:
