@@ -193,7 +193,7 @@ def test_no_file_knows_the_machine_it_was_written_on():
     [
         ("see /ho" + "me/ann/x", True),
         ("../" + "shared/a.md", True),
-        ("http://10.0.0.7" + ":80/", True),
+        ("http://" + "10.0.0.7:80/", True),
         ("https://docs.example.org/work/a and docs/work/a", False),
     ],
 )
