@@ -3,12 +3,14 @@
 Modules that need JAX are imported inside the commands, so that the help comes at once.
 """
 
+import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nlcwfs.commands.console import mendable
+from nlcwfs.commands.console import INTERRUPTED, mendable
 
 app = typer.Typer(
     name="nlcwfs",
@@ -125,7 +127,15 @@ def figure(
 
 def main() -> None:
     """Entry point of the command `nlcwfs`."""
-    app()
+    try:
+        app()
+    except SystemExit as end:
+        if end.code != INTERRUPTED:
+            raise
+        # JAX may be interrupted in the middle of compiling; taking it down in order then crashes now and then.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
     "nlcwfs.estimation.reconstructor:problem_at": "fills a record from a level",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
-    "nlcwfs.interop.frames_reconstruction:sensor_geometry": "needs a file of frames",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
 }

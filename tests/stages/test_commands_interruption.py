@@ -67,7 +67,7 @@ def test_before_the_first_frame_nothing_is_written(tmp_path, frames, monkeypatch
     interrupted_after(0, monkeypatch)
     result = type_in("reconstruct", frames, "--out", tmp_path / "w.fits")
     assert result.exit_code == 130
-    assert result.stderr.strip() == "nlcwfs: interrupted: nothing was written"
+    assert result.stderr.strip() == "nlcwfs: interrupted before the first frame: nothing was written"
     assert not (tmp_path / "w.fits").exists()
 
 

@@ -1,6 +1,8 @@
 """What a command says, and where: results on stdout, warnings, errors and progress on stderr."""
 
 import functools
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import ParamSpec, TypeVar
@@ -47,10 +49,23 @@ def mendable(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
                 complain(line)
             raise typer.Exit(USER_CAN_MEND) from None
         except KeyboardInterrupt:
-            complain("interrupted: nothing was written")
+            complain("interrupted")
             raise typer.Exit(INTERRUPTED) from None
 
     return checked
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Let no Ctrl-C in while results are being saved; signals belong to the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

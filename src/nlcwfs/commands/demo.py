@@ -34,13 +34,16 @@ def run_demo(folder: Path, *, seed: int) -> int:
     simulate(config, SimulateOptions(frames, warnings=False))
     say("\n2. Reconstruct the wavefront from these images alone:")
     result = reconstruct(load_config(settings), ReconstructOptions(frames, wavefront))
+    found = result.wavefront.finished().get(0)
+    if found is None:
+        return result.exit_code
     say("\n3. Look at it:")
     with working("Drawing"):
         from nlcwfs.studies.pictures import draw_single_frame, save_picture
 
         simulator = ExposureSimulator.build(config)
         exposure = simulator.expose(frame_key(seed=seed, frame=0))
-        case = judged(simulator, exposure, result.frames, result.wavefront.finished()[0])
+        case = judged(simulator, exposure, result.frames, found)
         save_picture(draw_single_frame(case), picture)
     for line in case_lines(case)[:2]:
         say(line)

@@ -16,6 +16,7 @@ from nlcwfs.commands.console import (
     percent,
     say,
     tracked,
+    undisturbed,
     use_precision,
     warn,
     working,
@@ -83,10 +84,15 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
     for line in header_lines(frames, reconstructor, already=len(done)):
         say(line, quiet=options.quiet)
     interrupted = run(reconstructor, done, quiet=options.quiet)
-    if interrupted and not done:
-        raise KeyboardInterrupt
-    wavefront = WavefrontFile.from_frames(done, frames, method=config.estimation.method, noll=reconstructor.noll)
-    write_wavefront(options.out, wavefront, Provenance.collect(settings, seed=None, device=device()))
+    with undisturbed():
+        wavefront = WavefrontFile.from_frames(done, frames, method=config.estimation.method, noll=reconstructor.noll)
+        if done:
+            write_wavefront(options.out, wavefront, Provenance.collect(settings, seed=None, device=device()))
+    if interrupted:
+        left = wavefront.outcomes.count("not run")
+        kept = f"{len(done)} frames are in {options.out}, {left} are not run; go on with --resume"
+        complain(f"interrupted: {kept}" if done else "interrupted before the first frame: nothing was written")
+        return Result(frames, wavefront, INTERRUPTED)
     for line in result_lines(wavefront, light_lost(reconstructor, done)):
         say(line, quiet=options.quiet)
     written = [str(options.out)]
@@ -97,10 +103,6 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
         save_picture(draw_reconstruction(frames, wavefront, shown), options.plot)
         written.append(str(options.plot))
     say(f"Wrote {' and '.join(written)}.", quiet=options.quiet)
-    if interrupted:
-        left = wavefront.outcomes.count("not run")
-        complain(f"interrupted: {len(done)} frames are in {options.out}, {left} are not run; go on with --resume")
-        return Result(frames, wavefront, INTERRUPTED)
     good = all(is_success(outcome) for outcome in wavefront.outcomes)
     return Result(frames, wavefront, 0 if good else NOT_A_SUCCESS)
 

@@ -15,9 +15,8 @@ from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis, modal_basis
 from nlcwfs.beam.pupil import inside, light_weights
-from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.sampling_cost import SensedLight, light_outside
-from nlcwfs.beam.zernike import ZernikeFit, zernike_fit, zernikes
+from nlcwfs.beam.zernike import ZernikeFit
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
 from nlcwfs.detector.pixels import fraction_outside_window
 from nlcwfs.estimation.outcome import Outcome
@@ -26,11 +25,8 @@ from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_file import FramesFile
+from nlcwfs.interop.frames_sensor import scored_pupil, sensor_geometry, well_seen_zernikes
 from nlcwfs.interop.wavefront_file import FrameWavefront
-
-WELL_SEEN = 2.0
-"""Zernikes are listed as long as noise in the worst combination of them is below twice that in the best: beyond, even
-tilt takes up noise from the last ones, because all are fitted together."""
 
 MOST_ZERNIKES = 800
 """More are in no optician's table; the wavefront itself holds them all."""
@@ -194,35 +190,6 @@ def _estimate(
     return solver.estimate(counts, usable, read_variance=read_variance)
 
 
-def sensor_geometry(frames: FramesFile) -> SensorGeometry:
-    """The sensor that a file of frames describes: one colour, no static aberration."""
-    if frames.pupil is None:
-        shape = PupilShape(frames.diameter_m, frames.obstruction_ratio)
-    else:
-        shape = PupilShape(frames.diameter_m, amplitude_map=frames.pupil, map_pixel_m=frames.pixel_m)
-    return SensorGeometry(
-        pupil=shape,
-        frame=Grid(frames.electrons.shape[2:], frames.pixel_m),
-        wavelength_m=frames.wavelength_m,
-        distances_m=frames.distances_m,
-        flux_fractions=frames.flux_fractions,
-    )
-
-
-def pupil_on_frame(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
-    """Amplitude of the pupil on the pixels of a frame, which may be narrower than the pupil."""
-    rows, columns = geometry.frame.shape
-    margin = math.ceil(geometry.pupil.diameter_m / geometry.frame.pixel_m / 2)
-    pupil = geometry.pupil.on(Grid((rows + 2 * margin, columns + 2 * margin), geometry.frame.pixel_m))
-    return pupil[margin : margin + rows, margin : margin + columns]
-
-
-def scored_pupil(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
-    """The pupil on the pixels that count for a wavefront: those at least half lit."""
-    pupil = pupil_on_frame(geometry)
-    return np.where(inside(pupil), pupil, 0)
-
-
 def rms_m(opd_m: Float[np.ndarray, "y x"], weights: Float[np.ndarray, "y x"]) -> float:
     """Rms over the light, piston removed; pixels that are NaN do not count.
 
@@ -255,24 +222,6 @@ def is_success(name: str) -> bool:
         (True, False, False)
     """
     return any(outcome.succeeded and outcome_name(outcome) == name for outcome in Outcome)
-
-
-def well_seen_zernikes(pupil: Float[np.ndarray, "y x"], geometry: SensorGeometry, *, most: int) -> ZernikeFit:
-    """The fit of as many whole radial orders of Zernikes, `most` at most, as this pupil tells apart well."""
-    grid, diameter_m = geometry.frame, geometry.pupil.diameter_m
-    weights = light_weights(pupil)
-    lit = weights > 0
-    most = max(1, min(most, int(lit.sum()) // 2))
-    seen = zernikes(most, grid, diameter_m=diameter_m)[:, lit] * np.sqrt(weights[lit])
-    gram = seen @ seen.T
-    counts = sorted({min(most, (n + 1) * (n + 2) // 2) for n in range(math.isqrt(2 * most) + 2)})
-    low, high = 0, len(counts) - 1  # piston alone is always well seen
-    while low < high:
-        middle = (low + high + 1) // 2
-        spread = np.linalg.eigvalsh(gram[: counts[middle], : counts[middle]])
-        good = spread[0] > 0 and spread[-1] / spread[0] <= WELL_SEEN**2
-        low, high = (middle, high) if good else (low, middle - 1)
-    return zernike_fit(pupil, grid, diameter_m=diameter_m, count=counts[low])
 
 
 def _basis(pupil: Float[np.ndarray, "y x"], geometry: SensorGeometry, settings: EstimationSettings) -> ModalBasis:

@@ -8,20 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.interop.atomic_write import atomic_write
 from nlcwfs.interop.frames_file import FramesFile
-from nlcwfs.interop.frames_reconstruction import pupil_on_frame, rms_m, scored_pupil, sensor_geometry
+from nlcwfs.interop.frames_reconstruction import rms_m
+from nlcwfs.interop.frames_sensor import pupil_on_frame, scored_pupil, sensor_geometry
 from nlcwfs.interop.wavefront_file import WavefrontFile
 from nlcwfs.science.point_spread_function import point_spread_function, strehl_ratio
+from nlcwfs.studies.board import Board
 from nlcwfs.studies.single_frame import PSF_PIXELS, PSF_WIDTH, SingleFrame
 
 INTENSITY, PHASE, HEIGHT, ERROR = "inferno", "twilight", "viridis", "RdBu_r"
@@ -29,9 +29,6 @@ PHASE_TICKS = {-np.pi: "\N{MINUS SIGN}π", 0.0: "0", np.pi: "π"}
 
 FAINTEST = 1e-4
 """Images of the star are drawn down to this part of the peak of a perfect telescope."""
-
-PANEL_IN = 2.35
-"""Width of a panel in inches: four of them fill the width of a page."""
 
 
 def save_picture(figure: Figure, path: Path) -> None:
@@ -50,7 +47,7 @@ def draw_single_frame(case: SingleFrame) -> Figure:
     With another number of planes the upper row has as many panels, and the letters go on from there.
     """
     frames, letters = case.frames, _letters()
-    board = _Board(rows=2, columns=max(4, frames.electrons.shape[1]))
+    board = Board(rows=2, columns=max(4, frames.electrons.shape[1]))
     _draw_frames(board, frames, 0, letters)
     wavelength_m, width_m = frames.wavelength_m, case.light.pixel_m
     phase_rad = np.angle(np.exp(2j * np.pi / wavelength_m * case.opd_m))
@@ -83,7 +80,7 @@ def draw_reconstruction(frames: FramesFile, wavefront: WavefrontFile, number: in
     if frames.truth_m is not None:
         truth_m = frames.truth_m if frames.truth_m.ndim == 2 else frames.truth_m[number]
     letters = _letters()
-    board = _Board(rows=3, columns=max(4, frames.electrons.shape[1]))
+    board = Board(rows=3, columns=max(4, frames.electrons.shape[1]))
     _draw_frames(board, frames, number, letters)
     _draw_residuals(board, frames, wavefront, number, letters)
     opd_m, width_m = wavefront.opd_m[number], frames.pixel_m
@@ -110,62 +107,6 @@ def draw_reconstruction(frames: FramesFile, wavefront: WavefrontFile, number: in
     return board.figure
 
 
-class _Board:
-    """Square panels of equal size in rows, each row with a thin strip below for its bars of colour; in inches."""
-
-    gap, above, below = 0.14, 0.26, 0.50
-    strip_from, strip_height = 0.07, 0.08
-
-    def __init__(self, *, rows: int, columns: int) -> None:
-        self.width = self.gap + (PANEL_IN + self.gap) * columns
-        self.height = (self.above + PANEL_IN + self.below) * rows
-        self.figure = Figure(figsize=(self.width, self.height))
-        FigureCanvasAgg(self.figure)
-        self.panels: dict[tuple[int, int], Axes] = {}
-
-    def panel(self, row: int, column: int) -> Axes:
-        """The panel at this place, made when it is first asked for."""
-        if (row, column) not in self.panels:
-            self.panels[row, column] = self._axes(self._left(column), self._floor(row), PANEL_IN, PANEL_IN)
-        return self.panels[row, column]
-
-    def bar(
-        self,
-        image: AxesImage,
-        row: int,
-        first: int,
-        label: str,
-        *,
-        last: int | None = None,
-        ticks: dict[float, str] | None = None,
-    ) -> None:
-        """A bar of colour below one panel, or below several."""
-        inset = 0.06 * PANEL_IN  # room for the numbers at its ends
-        width = self._left(first if last is None else last) + PANEL_IN - self._left(first) - 2 * inset
-        bottom = self._floor(row) - self.strip_from - self.strip_height
-        strip = self._axes(self._left(first) + inset, bottom, width, self.strip_height)
-        bar = self.figure.colorbar(image, cax=strip, orientation="horizontal")
-        bar.set_label(label, fontsize=8)
-        bar.ax.xaxis.set_label_coords(0.5, -0.26 / self.strip_height)
-        bar.ax.tick_params(labelsize=7.5, length=2, pad=1.5)
-        bar.ax.minorticks_off()
-        if ticks:
-            bar.set_ticks(list(ticks), labels=list(ticks.values()))
-        elif not isinstance(image.norm, LogNorm):
-            bar.locator = MaxNLocator(5 if last is None else 8)
-            bar.update_ticks()
-
-    def _left(self, column: int) -> float:
-        return self.gap + (PANEL_IN + self.gap) * column
-
-    def _floor(self, row: int) -> float:
-        return self.height - (self.above + PANEL_IN) * (row + 1) - self.below * row
-
-    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        place = (left / self.width, bottom / self.height, width / self.width, height / self.height)
-        return self.figure.add_axes(place)
-
-
 def _letters() -> Iterator[str]:
     """a, b, ..., z, a2, b2, ..."""
     for turn in itertools.count(1):
@@ -173,7 +114,7 @@ def _letters() -> Iterator[str]:
             yield letter if turn == 1 else f"{letter}{turn}"
 
 
-def _draw_frames(board: _Board, frames: FramesFile, number: int, letters: Iterator[str]) -> None:
+def _draw_frames(board: Board, frames: FramesFile, number: int, letters: Iterator[str]) -> None:
     counts = np.where(frames.masked[number], np.nan, frames.photo_electrons()[number])
     top = max(float(np.nanpercentile(counts, 99.7)), 1e-3)
     for column, (plane, distance_m) in enumerate(zip(counts, frames.distances_m, strict=True)):
@@ -187,7 +128,7 @@ def _draw_frames(board: _Board, frames: FramesFile, number: int, letters: Iterat
 
 
 def _draw_residuals(
-    board: _Board, frames: FramesFile, wavefront: WavefrontFile, number: int, letters: Iterator[str]
+    board: Board, frames: FramesFile, wavefront: WavefrontFile, number: int, letters: Iterator[str]
 ) -> None:
     if wavefront.residual is None:
         return
@@ -240,7 +181,7 @@ def _draw_psf(panel: Axes, psf: Float[np.ndarray, "v u"], pixel_rad: float) -> A
 
 
 def _draw_star(
-    board: _Board, column: int, name: str, opd_m: Float[np.ndarray, "y x"], frames: FramesFile, letters: Iterator[str]
+    board: Board, column: int, name: str, opd_m: Float[np.ndarray, "y x"], frames: FramesFile, letters: Iterator[str]
 ) -> None:
     """The star through a wavefront that is known on the frames' pixels."""
     geometry = sensor_geometry(frames)

@@ -1,0 +1,90 @@
+"""The sensor behind a file of frames: its geometry, the pixels that count, and the Zernikes these tell apart."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.pupil import inside, light_weights
+from nlcwfs.beam.pupil_shape import PupilShape
+from nlcwfs.beam.zernike import ZernikeFit, zernike_fit, zernikes
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.interop.frames_file import FramesFile
+
+WELL_SEEN = 2.0
+"""Zernikes are listed as long as noise in the worst combination of them is below twice that in the best: beyond, even
+tilt takes up noise from the last ones, because all are fitted together."""
+
+
+def sensor_geometry(frames: FramesFile) -> SensorGeometry:
+    """The sensor that a file of frames describes: one colour, no static aberration.
+
+    Examples:
+        >>> frames = FramesFile(
+        ...     electrons=np.ones((1, 2, 8, 9)), masked=np.zeros((1, 2, 8, 9), bool), has_frame_axis=False,
+        ...     pixel_m=1.0, wavelength_m=0.65e-6, diameter_m=8.0, distances_m=(-2.5e6, 2.5e6),
+        ... )
+        >>> sensor_geometry(frames).frame.shape
+        (8, 9)
+    """
+    if frames.pupil is None:
+        shape = PupilShape(frames.diameter_m, frames.obstruction_ratio)
+    else:
+        shape = PupilShape(frames.diameter_m, amplitude_map=frames.pupil, map_pixel_m=frames.pixel_m)
+    return SensorGeometry(
+        pupil=shape,
+        frame=Grid(frames.electrons.shape[2:], frames.pixel_m),
+        wavelength_m=frames.wavelength_m,
+        distances_m=frames.distances_m,
+        flux_fractions=frames.flux_fractions,
+    )
+
+
+def pupil_on_frame(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
+    """Amplitude of the pupil on the pixels of a frame, which may be narrower than the pupil.
+
+    Examples:
+        >>> pupil_on_frame(SensorGeometry(PupilShape(8.0), Grid((4, 6), 1.0), 0.65e-6, (3e6,))).shape
+        (4, 6)
+    """
+    rows, columns = geometry.frame.shape
+    margin = math.ceil(geometry.pupil.diameter_m / geometry.frame.pixel_m / 2)
+    pupil = geometry.pupil.on(Grid((rows + 2 * margin, columns + 2 * margin), geometry.frame.pixel_m))
+    return pupil[margin : margin + rows, margin : margin + columns]
+
+
+def scored_pupil(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
+    """The pupil on the pixels that count for a wavefront: those at least half lit.
+
+    Examples:
+        >>> pupil = scored_pupil(SensorGeometry(PupilShape(8.0), Grid((4, 10), 1.0), 0.65e-6, (3e6,)))
+        >>> bool(pupil[0, 0] == 0), bool(pupil[0, 5] == 1)
+        (True, True)
+    """
+    pupil = pupil_on_frame(geometry)
+    return np.where(inside(pupil), pupil, 0)
+
+
+def well_seen_zernikes(pupil: Float[np.ndarray, "y x"], geometry: SensorGeometry, *, most: int) -> ZernikeFit:
+    """The fit of as many whole radial orders of Zernikes, `most` at most, as this pupil tells apart well.
+
+    Examples:
+        >>> geometry = SensorGeometry(PupilShape(8.0), Grid((20, 20), 0.5), 0.65e-6, (-3e6, 3e6))
+        >>> well_seen_zernikes(scored_pupil(geometry), geometry, most=800).matrix.shape
+        (45, 20, 20)
+    """
+    grid, diameter_m = geometry.frame, geometry.pupil.diameter_m
+    weights = light_weights(pupil)
+    lit = weights > 0
+    most = max(1, min(most, int(lit.sum()) // 2))
+    seen = zernikes(most, grid, diameter_m=diameter_m)[:, lit] * np.sqrt(weights[lit])
+    gram = seen @ seen.T
+    counts = sorted({min(most, (n + 1) * (n + 2) // 2) for n in range(math.isqrt(2 * most) + 2)})
+    low, high = 0, len(counts) - 1  # piston alone is always well seen
+    while low < high:
+        middle = (low + high + 1) // 2
+        spread = np.linalg.eigvalsh(gram[: counts[middle], : counts[middle]])
+        good = spread[0] > 0 and spread[-1] / spread[0] <= WELL_SEEN**2
+        low, high = (middle, high) if good else (low, middle - 1)
+    return zernike_fit(pupil, grid, diameter_m=diameter_m, count=counts[low])
