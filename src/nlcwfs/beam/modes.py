@@ -36,6 +36,7 @@ class ModalBasis(eqx.Module):
         cycles_per_aperture: Spatial frequency of every mode, cycles per telescope diameter.
         kolmogorov_rad2: Variance of every coefficient in Kolmogorov turbulence of D / r0 = 1;
             times (D / r0)^(5/3) otherwise.
+        kolmogorov_total_rad2: Variance of all such turbulence on these pixels, piston excluded.
         raw_condition: Condition number of the functions the modes were made from, on this pupil.
         condition: Condition number of the modes themselves; 1 but for rounding.
     """
@@ -44,6 +45,7 @@ class ModalBasis(eqx.Module):
     weights: Float[np.ndarray | Array, "y x"]
     cycles_per_aperture: Float[np.ndarray | Array, " mode"]
     kolmogorov_rad2: Float[np.ndarray | Array, " mode"]
+    kolmogorov_total_rad2: float = eqx.field(static=True)
     raw_condition: float = eqx.field(static=True)
     condition: float = eqx.field(static=True)
 
@@ -78,6 +80,7 @@ class ModalBasis(eqx.Module):
             self.weights,
             self.cycles_per_aperture[:count],
             self.kolmogorov_rad2[:count],
+            self.kolmogorov_total_rad2,
             self.raw_condition,
             self.condition,
         )
@@ -158,7 +161,8 @@ def modal_basis(
     modes[:, lit] = (columns / root[:, None]).T
     spread = np.linalg.eigvalsh(columns.T @ columns)
     condition = float(np.sqrt(spread[-1] / spread[0]))
-    return ModalBasis(modes, weights, cycles[:count], variance[:count], raw_condition, condition)
+    total = _kolmogorov_total(weights, grid.pixel_m / diameter_m)
+    return ModalBasis(modes, weights, cycles[:count], variance[:count], total, raw_condition, condition)
 
 
 def _orthonormal_pool(
@@ -197,10 +201,7 @@ def _kolmogorov_covariance(
     For modes without piston it is -1/2 sum w m(r) D(r - r') w' m'(r'), a convolution on a doubled grid.
     """
     ny, nx = lit.shape
-    y = np.fft.fftfreq(2 * ny, 1 / (2 * ny))[:, None] * pixel
-    # One part in a thousand of anisotropy settles which way the twins (cos and sin) turn, on any machine.
-    x = np.fft.fftfreq(2 * nx, 1 / (2 * nx))[None, :] * pixel * 1.001
-    kernel = np.fft.rfft2(-KOLMOGOROV_STRUCTURE / 2 * np.hypot(y, x) ** (5 / 3))
+    kernel = _covariance_kernel(lit.shape, pixel)
     smeared = np.empty_like(columns)
     for first in range(0, columns.shape[1], 32):  # a few at a time: memory
         part = slice(first, first + 32)
@@ -210,6 +211,22 @@ def _kolmogorov_covariance(
         smeared[:, part] = np.fft.irfft2(spectra, s=(2 * ny, 2 * nx))[:, :ny, :nx][:, lit].T
     covariance = columns.T @ (smeared * root[:, None])
     return (covariance + covariance.T) / 2
+
+
+def _kolmogorov_total(weights: np.ndarray, pixel: float) -> float:
+    """Variance of the turbulence on the pixels for D / r0 = 1, piston excluded: 1/2 sum w D(r - r') w'."""
+    ny, nx = weights.shape
+    spectrum = np.fft.rfft2(weights, s=(2 * ny, 2 * nx)) * _covariance_kernel(weights.shape, pixel)
+    return float(-np.sum(weights * np.fft.irfft2(spectrum, s=(2 * ny, 2 * nx))[:ny, :nx]))
+
+
+def _covariance_kernel(shape: tuple[int, ...], pixel: float) -> np.ndarray:
+    """Fourier transform of -1/2 D(r) on a doubled grid."""
+    ny, nx = shape
+    y = np.fft.fftfreq(2 * ny, 1 / (2 * ny))[:, None] * pixel
+    # One part in a thousand of anisotropy settles which way the twins (cos and sin) turn, on any machine.
+    x = np.fft.fftfreq(2 * nx, 1 / (2 * nx))[None, :] * pixel * 1.001
+    return np.fft.rfft2(-KOLMOGOROV_STRUCTURE / 2 * np.hypot(y, x) ** (5 / 3))
 
 
 def _cycles_of_variance(variance: np.ndarray, root: np.ndarray, pixel: float) -> np.ndarray:

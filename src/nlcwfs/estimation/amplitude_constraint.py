@@ -11,7 +11,7 @@ LARGEST_FACTOR = 3.0
 DARK_SHARE = 0.2
 """Share of the mean count that counts as model light where the model is dark."""
 
-FLOOR = 0.1
+FLOOR = 0.3
 """Share of the mean count added to the variance, so that dark pixels do not rule the step."""
 
 
@@ -24,6 +24,7 @@ def modulus_factor(
     read_variance: float | Float[Array, ""] = 0.0,
     doubt: float = 0.0,
     mean: Float[Array, "plane 1 1"] | None = None,
+    expected: Float[Array, "plane y x"] | None = None,
 ) -> Float[Array, "plane y x"]:
     r"""By how much to multiply the model's light on each pixel.
 
@@ -42,6 +43,8 @@ def modulus_factor(
         doubt: Relative variance of the model itself, while its phase is still coarse: bright speckles then
             weigh no more than faint ones. The step keeps its mean length, see `doubt_factor`.
         mean: `mean_count`, when it is known already.
+        expected: Counts smoothed over a speckle; they stand for n in V. At a photon a pixel, V from the count itself
+            errs with the count and biases the step: 44 nm instead of 53 at 2e3 photons (study 01).
 
     Examples:
         >>> import jax.numpy as jnp
@@ -55,7 +58,8 @@ def modulus_factor(
         factor = jnp.sqrt(jnp.maximum(counts, 0) / jnp.maximum(model, tiny))
         return jnp.where(usable & (model > tiny), factor, 1)
     mean = mean_count(counts, usable) if mean is None else mean
-    variance = (jnp.maximum(counts, 0) + model) / 2 + FLOOR * mean + read_variance
+    expected = jnp.maximum(counts, 0) if expected is None else expected
+    variance = (expected + model) / 2 + FLOOR * mean + read_variance
     variance = variance + doubt * (model + DARK_SHARE * mean) ** 2
     # A dark plane has no variance at all, and nothing to say.
     variance = jnp.maximum(variance, jnp.finfo(counts.dtype).tiny)

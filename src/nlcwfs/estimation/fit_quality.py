@@ -1,58 +1,78 @@
 """Does the wavefront explain the images? The test that tells a wrong solution."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.resolution_level import Measurement
+from nlcwfs.estimation.speckle_blur import blurred, smoothing_factor
 
-BLOCK = 4
-"""Residuals are summed over 4 x 4 pixels: enough counts to judge, small enough for a speckle."""
+FINEST = 0.022
+"""Speckles are judged from this width on, over the telescope's diameter: finer ones drown in photon noise."""
 
-MODEL_ERROR = 0.15
-"""Relative error that the model itself may make on such a block (coarse pixels, light beyond the window)."""
+WIDEST = 3 * FINEST
+"""... up to this width: wider light is the pupil's own shape, which any wavefront explains."""
 
-BELIEVED = 2.0
-"""Misfit above which a wavefront is not believed (study 01 states the rates of false alarms and misses)."""
+BELIEVED = 0.03
+"""Unexplained share above which a wavefront is not believed (study 01 states how often that errs)."""
+
+VISIBLE = 5.0
+"""Speckles must exceed photon noise by so many of its standard deviations; else there is nothing to believe."""
 
 
-def fit_quality(measurement: Measurement, model: Float[Array, "plane y x"]) -> Float[Array, ""]:
-    """Mean squared residual over its expected variance, on blocks of pixels.
+def speckle_band(grid: Grid, *, diameter_m: float) -> Float[np.ndarray, "v fu"]:
+    """Fourier factor that keeps speckles: a narrow Gaussian less a wide one."""
+    narrow = smoothing_factor(grid, radius_m=FINEST * diameter_m)
+    return narrow - smoothing_factor(grid, radius_m=WIDEST * diameter_m)
+
+
+def unexplained_share(
+    measurement: Measurement, model: Float[Array, "plane y x"], band: Float[Array, "y fu"]
+) -> Float[Array, ""]:
+    """Share of the variance of the speckles that neither the model nor photon noise explains.
 
     Args:
         measurement: Counts.
         model: What the wavefront predicts, photo-electrons on the same pixels.
+        band: See `speckle_band`.
 
     Returns:
-        About 1 when noise alone separates model and counts; about half the counts per block for a wrong phase.
+        0 or a little below when the model fits, down to its share of noise when it fits noise too; towards 1 and more
+        for a wrong wavefront; 1 when the frames hold no speckles.
     """
-    known = measurement.usable
-    counts = _blocks(jnp.where(known, measurement.counts, 0))
-    expected = _blocks(jnp.where(known, model, 0))
-    number = _blocks(known.astype(counts.dtype))
-    variance = expected + number * measurement.read_variance + (MODEL_ERROR * expected) ** 2
-    floor = jnp.maximum(0.05 * jnp.mean(counts), jnp.finfo(counts.dtype).tiny)
-    seen = number > 0
-    return jnp.sum(jnp.where(seen, (counts - expected) ** 2 / (variance + floor), 0)) / jnp.maximum(
-        jnp.sum(seen.astype(counts.dtype)), 1
-    )
+    usable = measurement.usable
+    factor = jnp.broadcast_to(band, (model.shape[0], *band.shape))
+    counts = jnp.where(usable, measurement.counts, 0)
+    seen = blurred(counts, factor)
+    missed = blurred(counts - jnp.where(usable, model, 0), factor)
+    # A pixel of variance 1 leaves the mean of the filter's squared modulus (Parseval).
+    passed = jnp.mean(_whole_plane(band, model.shape[2]) ** 2)
+    single = jnp.where(usable, jnp.maximum(counts, 0) + measurement.read_variance, 0)
+    noise = passed * jnp.mean(single, axis=(1, 2))
+    speckles = jnp.mean(seen**2, axis=(1, 2)) - noise
+    # The variance of noise is known from about as many independent samples as the filter passes.
+    doubt = VISIBLE * noise * jnp.sqrt(2 / (passed * seen[0].size))
+    share = (jnp.mean(missed**2, axis=(1, 2)) - noise) / jnp.maximum(speckles, doubt)
+    return jnp.where(jnp.any(speckles > doubt), jnp.mean(jnp.where(speckles > doubt, share, 1)), 1)
 
 
 def verdict(
     *,
-    misfit: Float[Array, ""],
+    unexplained: Float[Array, ""],
     plane_counts: Float[Array, " plane"],
     rests: Array,
     finite: Array,
 ) -> Int[Array, ""]:
     """The outcome of a reconstruction, as a number of `Outcome`."""
     code = jnp.where(rests, Outcome.CONVERGED, Outcome.BUDGET_SPENT)
-    code = jnp.where(misfit > BELIEVED, Outcome.NOT_EXPLAINED, code)
+    code = jnp.where(unexplained > BELIEVED, Outcome.NOT_EXPLAINED, code)
     code = jnp.where(jnp.any(plane_counts <= 0), Outcome.NO_LIGHT, code)
     return jnp.where(finite, code, Outcome.NOT_FINITE).astype(jnp.int32)
 
 
-def _blocks(array: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
-    planes, rows, columns = array.shape
-    array = jnp.pad(array, ((0, 0), (0, -rows % BLOCK), (0, -columns % BLOCK)))
-    return array.reshape(planes, -(-rows // BLOCK), BLOCK, -(-columns // BLOCK), BLOCK).sum(axis=(2, 4))
+def _whole_plane(half: Float[Array, "y fu"], columns: int) -> Float[Array, "y u"]:
+    """A real Fourier factor with its conjugate half (the same at -f: only its columns are mirrored)."""
+    mirrored = half[:, 1 : (columns + 1) // 2][:, ::-1]
+    return jnp.concatenate([half, jnp.roll(mirrored[::-1], 1, axis=0)], axis=1)

@@ -12,8 +12,11 @@ from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, mod
 from nlcwfs.estimation.angle import angle, cosine_and_sine, wrap
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
-from nlcwfs.estimation.speckle_blur import blurred
-from nlcwfs.estimation.turbulence_filter import smoothed_phase
+from nlcwfs.estimation.speckle_blur import SPEED, blurred
+from nlcwfs.estimation.turbulence_filter import smoothed_phase, wiener_filter
+
+LARGEST_BEYOND = 3.0
+"""Unmodelled variance (rad^2) beyond which steps grow no further."""
 
 
 class GerchbergSaxtonState(eqx.Module):
@@ -39,6 +42,7 @@ class PlaneGroup(NamedTuple):
         transfer: Fresnel factor from the pupil.
         share: Weight of each plane in the mean of the returning light, sum 1.
         counts: Photo-electrons; 0 where not usable.
+        expected: The counts smoothed, see `Measurement`.
         usable: Which pixels were measured.
         total: Sum of the counts.
         mean: Mean count of the usable pixels.
@@ -48,6 +52,7 @@ class PlaneGroup(NamedTuple):
     transfer: Complex[Array, "p y x"]
     share: Float[Array, " p"]
     counts: Float[Array, "p v u"]
+    expected: Float[Array, "p v u"]
     usable: Bool[Array, "p v u"]
     total: Float[Array, "p 1 1"]
     mean: Float[Array, "p 1 1"]
@@ -134,6 +139,7 @@ def plane_groups(
                 transfer=level.optics.transfer[0, part],
                 share=share / jnp.sum(share),
                 counts=counts[part],
+                expected=(counts if measurement.expected is None else measurement.expected)[part],
                 usable=measurement.usable[part],
                 total=jnp.sum(counts[part], axis=(1, 2), keepdims=True),
                 mean=mean_count(counts[part], measurement.usable[part]),
@@ -141,6 +147,32 @@ def plane_groups(
             )
         )
     return groups
+
+
+def problem_at(
+    level: Level,
+    measured: Measurement,
+    settings: GerchbergSaxtonSettings,
+    reference_rad: Float[Array, "y x"],
+    cutoff: Int[Array, ""],
+    strength: Float[Array, ""],
+    low_pass: Float[Array, "y x"] | None,
+) -> Problem:
+    """What one cutoff of a level has to solve, for turbulence of this strength."""
+    # Blurred images answer the phase more weakly, by the coherence that is left: steps grow by its inverse.
+    gain = level.gain * jnp.exp(jnp.minimum(strength * level.beyond[cutoff], LARGEST_BEYOND))
+    blur = None
+    if level.structures is not None:
+        blur = level.smoothing[None] * jnp.exp(-0.5 * SPEED * strength * level.structures[cutoff])
+    return Problem(
+        level=level,
+        groups=plane_groups(level, measured, settings, blur=blur),
+        read_variance=measured.read_variance,
+        reference_rad=reference_rad,
+        kept=wiener_filter(level.power[cutoff] * strength, gain * phase_noise(level, measured)),
+        gain=gain,
+        low_pass=low_pass,
+    )
 
 
 def modelled_counts(level: Level, group: PlaneGroup, far: Complex[Array, "p y x"]) -> Float[Array, "p v u"]:
@@ -186,6 +218,7 @@ def _factor_on_pixels(
         read_variance=problem.read_variance,
         doubt=problem.level.doubt,
         mean=group.mean,
+        expected=group.expected,
     )
     if group.blur is None:
         return factor

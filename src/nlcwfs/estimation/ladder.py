@@ -105,7 +105,7 @@ def _level(
         for limit in limits_per_m
         if limit
     ]
-    smoothing = smoothing_factor(measured, radius_m=settings.smoothing_pixels * geometry.frame.pixel_m)
+    smoothing = smoothing_factor(measured, radius_m=settings.smoothing * diameter_m)
     return Level(
         optics=optics,
         modulus=jnp.asarray(pupil / np.sqrt(np.sum(pupil**2)), dtype),
@@ -114,7 +114,7 @@ def _level(
         power=jnp.asarray(np.array(power), dtype),
         structures=jnp.asarray(np.array(structures), dtype) if smooths else None,
         beyond=jnp.asarray(beyond, dtype),
-        smoothing=jnp.asarray(smoothing, dtype) if smooths else None,
+        smoothing=jnp.asarray(smoothing, dtype),
         grid=grid,
         binning=binning,
         oversampling=oversampling,

@@ -7,21 +7,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
+from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis
 from nlcwfs.estimation import gerchberg_saxton as gs
 from nlcwfs.estimation.centroid_tilt import centroid_tilt
-from nlcwfs.estimation.fit_quality import fit_quality, verdict
+from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share, verdict
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.ladder import build_ladder
 from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
-from nlcwfs.estimation.speckle_blur import SPEED
+from nlcwfs.estimation.speckle_blur import unmodelled_variance
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
-from nlcwfs.estimation.turbulence_filter import expected_error, wiener_filter
+from nlcwfs.estimation.turbulence_filter import expected_error
 from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
 from nlcwfs.estimation.unwrapping import SlopeUnwrapper
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+from nlcwfs.estimation.whole_turns import PASSES, slip_filter, without_slips
 
 TYPICAL_SEEING_ARCSEC = 0.6
 """Strength 1 of the turbulence: Table 1 of the paper."""
@@ -31,9 +33,6 @@ FIRST_STRENGTH_AT_FRIED = 0.1
 
 SENSOR_LOSS = 2.0
 """A sensor of speckles needs about twice the photons of the quantum limit, 1 / (4 N) rad^2 (study 01)."""
-
-LARGEST_BEYOND = 3.0
-"""Unmodelled variance (rad^2) beyond which steps grow no further."""
 
 
 class GerchbergSaxton(eqx.Module):
@@ -61,6 +60,9 @@ class GerchbergSaxton(eqx.Module):
     levels: tuple[Level, ...]
     unwrapper: SlopeUnwrapper | None
     first_strength: Float[Array, ""]
+    band: Float[Array, "v fu"]
+    smooth: Float[Array, "y fx"]
+    beyond_pixels: Float[Array, ""]
     settings: EstimationSettings = eqx.field(static=True)
     geometry: SensorGeometry = eqx.field(static=True)
     measures_strength: bool = eqx.field(static=True)
@@ -93,8 +95,15 @@ class GerchbergSaxton(eqx.Module):
         unwrapper = None
         if settings.unwrapping == "slopes" and basis is not None:
             unwrapper = SlopeUnwrapper.build(basis, passes=settings.remainder_passes, dtype=dtype)
+        levels = build_ladder(geometry, settings.gerchberg_saxton, air, dtype=dtype)
+        finest, diameter_m = levels[-1].grid, geometry.pupil.diameter_m
+        beyond = unmodelled_variance(air, wavelength_m=geometry.wavelength_m, cutoff_per_m=1 / (2 * finest.pixel_m))
+        measured = Grid(levels[-1].measured_shape, geometry.frame.pixel_m)
         return cls(
-            levels=build_ladder(geometry, settings.gerchberg_saxton, air, dtype=dtype),
+            levels=levels,
+            band=jnp.asarray(speckle_band(measured, diameter_m=diameter_m), dtype),
+            smooth=jnp.asarray(slip_filter(finest, diameter_m=diameter_m), dtype),
+            beyond_pixels=jnp.asarray(beyond, dtype),
             unwrapper=unwrapper,
             first_strength=jnp.asarray(weaker, dtype),
             settings=settings,
@@ -147,7 +156,6 @@ class GerchbergSaxton(eqx.Module):
         noise = SENSOR_LOSS * gs.phase_noise(level, measured)
         learns = self.measures_strength and carried and level is not self.levels[-1]
         planes = measured.counts.shape[0]
-
         low_pass = None
         if options.filter == "low-pass":
             low_pass = gs.low_pass_factor(
@@ -155,13 +163,13 @@ class GerchbergSaxton(eqx.Module):
                 cutoff_per_m=options.low_pass_cpa / self.geometry.pupil.diameter_m,
                 centre_per_m=slope / self.geometry.wavelength_m,
             )
-        if level.smoothing is not None:
-            measured = measured.smoothed(level.smoothing)
+        if level.structures is not None or options.amplitude == "poisson":
+            measured = measured.smoothed(level.smoothing, keep_counts=level.structures is None)
             climb = eqx.tree_at(lambda c: c.ffts, climb, climb.ffts + planes)
 
         def one_cutoff(climb: Climb, cutoff: Int[Array, ""]) -> tuple[Climb, None]:
             power = level.power[cutoff]
-            problem = problem_at(level, measured, options, tilt_rad + static_rad, cutoff, climb.strength, low_pass)
+            problem = gs.problem_at(level, measured, options, tilt_rad + static_rad, cutoff, climb.strength, low_pass)
             state = iterate(
                 lambda state: gs.step(problem, options, state),
                 lambda state: gs.terminate(problem, state),
@@ -189,7 +197,7 @@ class GerchbergSaxton(eqx.Module):
         """The tilt (y, x) that the whole reconstruction is relative to, metres per metre."""
         frame = self.geometry.frame
         if start_m is not None:
-            return mean_slope(start_m, jnp.asarray(self.geometry.pupil.on(frame) ** 2, start_m.dtype), frame)
+            return mean_slope(start_m, self._on_frame(self.levels[-1].light), frame)
         if self.settings.gerchberg_saxton.start == "flat":
             return jnp.zeros(2, measured.counts.dtype)
         return centroid_tilt(
@@ -219,25 +227,29 @@ class GerchbergSaxton(eqx.Module):
         near = gs.pupil_light(level, climb.phase_rad + tilt_rad + static_rad)
         far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * everything.transfer)
         model = gs.modelled_counts(level, everything, far)
-        misfit = fit_quality(measured, model)
-        phase_rad = self._on_frame(climb.phase_rad + tilt_rad)
+        unexplained = unexplained_share(measured, model, self.band)
+        phase_rad, slip_ffts = climb.phase_rad, 0
+        if self.settings.gerchberg_saxton.filter == "turbulence":
+            phase_rad, slip_ffts = without_slips(phase_rad, self.smooth), PASSES
+        phase_rad = self._on_frame(phase_rad + tilt_rad)
         if self.unwrapper is not None:
             phase_rad = self.unwrapper.unwrapped(phase_rad)
         opd_m = phase_rad * (wavelength_m / (2 * np.pi))
         light = self._on_frame(level.light)
         opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
         noise = SENSOR_LOSS * gs.phase_noise(level, measured)
+        seen_rad = expected_error(level.power[0] * climb.strength, noise, level.grid)
         residual = jnp.where(measured.usable, measured.counts - model, 0)
         return WavefrontEstimate(
             opd_m=opd_m,
-            predicted_error_m=expected_error(level.power[0] * climb.strength, noise, level.grid)
+            predicted_error_m=jnp.sqrt(seen_rad**2 + climb.strength * self.beyond_pixels)
             * (wavelength_m / (2 * np.pi)),
-            misfit=misfit,
+            unexplained=unexplained,
             residual=jnp.stack([_cropped(plane, self.geometry.frame.shape) for plane in residual]),
             iterations=climb.iterations,
-            ffts=climb.ffts + measured.counts.shape[0] + 1,
+            ffts=climb.ffts + 2 * measured.counts.shape[0] + 1 + slip_ffts,
             outcome_code=verdict(
-                misfit=misfit,
+                unexplained=unexplained,
                 plane_counts=everything.total.reshape(-1),
                 rests=climb.change_rad < level.tolerance_rad,
                 finite=jnp.all(jnp.isfinite(opd_m)),
@@ -267,32 +279,6 @@ class Climb(eqx.Module):
     iterations: Int[Array, ""]
     ffts: Int[Array, ""]
     change_rad: Float[Array, ""]
-
-
-def problem_at(
-    level: Level,
-    measured: Measurement,
-    options: GerchbergSaxtonSettings,
-    reference_rad: Float[Array, "y x"],
-    cutoff: Int[Array, ""],
-    strength: Float[Array, ""],
-    low_pass: Float[Array, "y x"] | None,
-) -> gs.Problem:
-    """What one cutoff of a level has to solve, for turbulence of this strength."""
-    # Blurred images answer the phase more weakly, by the coherence that is left: steps grow by its inverse.
-    gain = level.gain * jnp.exp(jnp.minimum(strength * level.beyond[cutoff], LARGEST_BEYOND))
-    blur = None
-    if level.structures is not None and level.smoothing is not None:
-        blur = level.smoothing[None] * jnp.exp(-0.5 * SPEED * strength * level.structures[cutoff])
-    return gs.Problem(
-        level=level,
-        groups=gs.plane_groups(level, measured, options, blur=blur),
-        read_variance=measured.read_variance,
-        reference_rad=reference_rad,
-        kept=wiener_filter(level.power[cutoff] * strength, gain * gs.phase_noise(level, measured)),
-        gain=gain,
-        low_pass=low_pass,
-    )
 
 
 def _cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:

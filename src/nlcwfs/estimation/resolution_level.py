@@ -17,11 +17,14 @@ class Measurement(eqx.Module):
         counts: Photo-electrons, background subtracted.
         usable: False where masked, saturated, or beyond the detector's window.
         read_variance: Variance of a pixel without light, electrons squared.
+        expected: The counts smoothed, for the variance of the noise: a pixel's own count is a poor guess of its mean,
+            and one that errs with the count biases the step. None where the counts are smooth already.
     """
 
     counts: Float[Array, "plane y x"]
     usable: Bool[Array, "plane y x"]
     read_variance: Float[Array, ""]
+    expected: Float[Array, "plane y x"] | None = None
 
     def padded(self, shape: tuple[int, int]) -> "Measurement":
         """The same counts in a wider window, whose rim was not measured."""
@@ -43,9 +46,11 @@ class Measurement(eqx.Module):
             self.read_variance * factor**2,
         )
 
-    def smoothed(self, factor: Float[Array, "y fx"]) -> "Measurement":
-        """Counts with each wave multiplied by a factor; masked ones should be filled (`binned`)."""
+    def smoothed(self, factor: Float[Array, "y fx"], *, keep_counts: bool) -> "Measurement":
+        """Counts with each wave multiplied by a factor, as the data or, beside them, for their noise alone."""
         smooth = blurred(self.counts, jnp.broadcast_to(factor, (self.counts.shape[0], *factor.shape)))
+        if keep_counts:
+            return Measurement(self.counts, self.usable, self.read_variance, jnp.maximum(smooth, 0))
         return Measurement(smooth, self.usable, self.read_variance)
 
 
@@ -61,7 +66,7 @@ class Level(eqx.Module):
         structures: For each cutoff, plane and wave of the images, the structure function of the phase beyond the
             cutoff (rad^2, see `speckle_blur`); None where everything is modelled.
         beyond: For each cutoff, variance of the phase beyond it, rad^2.
-        smoothing: Fourier factor that smooths counts and model alike; None for none.
+        smoothing: Fourier factor that smooths images.
         doubt: Relative variance of the model's intensity, see `modulus_factor`.
         grid: Cells of the model.
         binning: Detector pixels per measured pixel of this level, along an axis.
@@ -79,7 +84,7 @@ class Level(eqx.Module):
     power: Float[Array, "cutoff y fx"]
     structures: Float[Array, "cutoff plane v fu"] | None
     beyond: Float[Array, " cutoff"]
-    smoothing: Float[Array, "v fu"] | None
+    smoothing: Float[Array, "v fu"]
     grid: Grid = eqx.field(static=True)
     binning: int = eqx.field(static=True)
     oversampling: int = eqx.field(static=True)

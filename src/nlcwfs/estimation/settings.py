@@ -42,11 +42,12 @@ class GerchbergSaxtonSettings(BaseModel):
     coarse_doubt: float = Field(
         default=0.2, ge=0, le=10, description="relative variance of the model's light on the coarse levels"
     )
-    smoothing_pixels: float = Field(
-        default=1.0,
+    smoothing: float = Field(
+        default=0.022,
         ge=0,
-        le=10,
-        description="Gaussian that smooths the images on the coarse levels, detector pixels",
+        le=1,
+        description="Gaussian that smooths the images on the coarse levels, and the counts from which the noise is "
+        "known on all; standard deviation over the telescope's diameter",
     )
     binning: int = Field(
         default=1, ge=1, le=8, description="pixels binned on the levels that need no finer ones; 1 = never"

@@ -79,7 +79,10 @@ class SlopeUnwrapper(eqx.Module):
         lit_weights = weights[rows, columns]
         pair_weights = np.minimum(lit_weights[first], lit_weights[second])
         slopes = (modes[:, second] - modes[:, first]) * np.sqrt(pair_weights)
-        from_slopes = np.linalg.pinv(slopes.T, rcond=WEAKEST_DIRECTION) * np.sqrt(pair_weights)
+        strength, directions = np.linalg.eigh(slopes @ slopes.T)
+        kept = strength > WEAKEST_DIRECTION**2 * strength[-1]
+        inverse = (directions[:, kept] / strength[kept]) @ directions[:, kept].T
+        from_slopes = inverse @ slopes * np.sqrt(pair_weights)
         return cls(
             modes=jnp.asarray(modes, dtype),
             weights=jnp.asarray(lit_weights, dtype),

@@ -13,7 +13,7 @@ class WavefrontEstimate(eqx.Module):
         opd_m: Unwrapped optical path difference on the frames' pixels, zero mean over the pupil. It goes on
             smoothly beyond the pupil, where it means nothing.
         predicted_error_m: Expected rms error over the pupil, from photon noise and turbulence; one sigma.
-        misfit: How badly the model explains the counts: 1 if by noise alone, see `fit_quality`.
+        unexplained: Share of the speckles that neither model nor noise explains, see `fit_quality`.
         residual: Counts minus model, photo-electrons.
         iterations: Iterations, over all resolutions.
         ffts: Two-dimensional FFTs of one plane, over all resolutions.
@@ -23,7 +23,7 @@ class WavefrontEstimate(eqx.Module):
 
     opd_m: Float[Array, "*frame y x"]
     predicted_error_m: Float[Array, "*frame"]
-    misfit: Float[Array, "*frame"]
+    unexplained: Float[Array, "*frame"]
     residual: Float[Array, "*frame plane y x"]
     iterations: Int[Array, "*frame"]
     ffts: Int[Array, "*frame"]

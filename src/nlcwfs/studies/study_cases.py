@@ -1,0 +1,91 @@
+"""The question of a study and the cases that answer it, as written in its `study.toml`."""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from nlcwfs.config import Config, load_config
+from nlcwfs.errors import FileFormatError
+
+
+class Case(BaseModel):
+    """One row of the table: a sensor, a sky and a reconstructor, over many screens.
+
+    Attributes:
+        name: Unique within the study.
+        group: Cases of a group belong into one table or picture.
+        telescope_over_fried: D / r0 at the sensing wavelength; replaces `atmosphere.opd_rms_nm`.
+        screens: Number of screens; that of the study when left out.
+        light: `finer` runs the light on its own grid; `matched` on the grid of the reconstructor, which flatters.
+        strength: `measured` from the frames, or `known` to the reconstructor.
+        bound: Whether to compute the photon bound.
+        set: Settings, as on the command line.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    group: str
+    telescope_over_fried: float | None = Field(default=None, gt=0)
+    screens: int | None = Field(default=None, ge=1)
+    light: Literal["finer", "matched"] = "finer"
+    strength: Literal["measured", "known"] = "measured"
+    bound: bool = False
+    set: tuple[str, ...] = ()
+
+
+class Study(BaseModel):
+    """A question, what all its cases share, and the cases."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    question: str
+    screens: int = Field(default=100, ge=1)
+    captured_nm: float = Field(default=60.0, gt=0)
+    set: tuple[str, ...] = ()
+    case: tuple[Case, ...]
+
+    def screens_of(self, case: Case) -> int:
+        """How many screens a case takes."""
+        return case.screens or self.screens
+
+    def config_of(self, case: Case) -> Config:
+        """The full configuration of a case.
+
+        Raises:
+            SettingsError: If a setting is impossible.
+        """
+        config = load_config(None, [*self.set, *case.set])
+        if case.telescope_over_fried is None:
+            return config
+        wavelength_nm = config.beam.wavelength_um * 1e3
+        rms_nm = wavelength_nm / (2 * math.pi) * math.sqrt(1.0299 * case.telescope_over_fried ** (5 / 3))
+        return load_config(None, [*self.set, *case.set, f"atmosphere.opd_rms_nm={rms_nm!r}"])
+
+
+def read_study(folder: Path) -> Study:
+    """The study of a folder.
+
+    Raises:
+        FileFormatError: If `study.toml` is missing or wrong.
+    """
+    path = folder / "study.toml"
+    if not path.is_file():
+        raise FileFormatError(f"{path}: must exist, got no such file")
+    try:
+        content: dict[str, Any] = tomllib.loads(path.read_text())
+        study = Study.model_validate(content, strict=False)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path}: must be TOML, got {error}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise FileFormatError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}") from None
+    names = [case.name for case in study.case]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise FileFormatError(f"{path}: case.name: must be unique, got twice {sorted(twice)}")
+    return study
