@@ -11,7 +11,7 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis
 from nlcwfs.estimation import gerchberg_saxton as gs
 from nlcwfs.estimation.centroid_tilt import centroid_tilt
-from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share, verdict
+from nlcwfs.estimation.fit_quality import BELIEVED, speckle_band, unexplained_share, verdict
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.ladder import build_ladder
 from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
@@ -250,6 +250,7 @@ class GerchbergSaxton(eqx.Module):
             ffts=climb.ffts + 2 * measured.counts.shape[0] + 1 + slip_ffts,
             outcome_code=verdict(
                 unexplained=unexplained,
+                believed=BELIEVED[self.settings.gerchberg_saxton.filter],
                 plane_counts=everything.total.reshape(-1),
                 rests=climb.change_rad < level.tolerance_rad,
                 finite=jnp.all(jnp.isfinite(opd_m)),

@@ -58,13 +58,15 @@ class Light(NamedTuple):
     weights: Float[np.ndarray, "Y X"]
 
 
-def run_study(folder: Path, *, progress: Progress, only: str | None = None, screens: int | None = None) -> StudyTable:
+def run_study(
+    folder: Path, *, progress: Progress, only: tuple[str, ...] = (), screens: int | None = None
+) -> StudyTable:
     """Run what the table of a study does not hold yet.
 
     Args:
         folder: Holds `study.toml`; the table goes beside it.
         progress: Called after each screen.
-        only: Run only the cases whose name starts so.
+        only: Run only the cases whose names start so.
         screens: Replaces the number of screens, for a quick look; such rows do not pass as the study's.
 
     Returns:
@@ -81,7 +83,7 @@ def run_study(folder: Path, *, progress: Progress, only: str | None = None, scre
     lights: dict[str, Light] = {}
     bounds: dict[str, LightInformation] = {}
     for case in study.case:
-        if only is not None and not case.name.startswith(only):
+        if only and not case.name.startswith(only):
             continue
         config, count = configs[case.name], screens or study.screens_of(case)
         digest = _digest(case, config, count, study.captured_nm)
@@ -94,7 +96,7 @@ def run_study(folder: Path, *, progress: Progress, only: str | None = None, scre
         row = run_case(case, config, study.captured_nm, lights[kind], progress)
         row |= _bound_columns(case, config, bounds)
         table.put({"case": case.name, "group": case.group} | row | {"digest": digest}, stamp)
-    if only is None and len(table.rows):
+    if not only and table.rows:
         table.sort([case.name for case in study.case], stamp)
     return table
 
