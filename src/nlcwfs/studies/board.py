@@ -53,7 +53,7 @@ class Board:
         strip = self._axes(self._left(first) + inset, bottom, width, self.strip_height)
         bar = self.figure.colorbar(image, cax=strip, orientation="horizontal")
         bar.set_label(label, fontsize=8)
-        bar.ax.xaxis.set_label_coords(0.5, -0.26 / self.strip_height)
+        bar.ax.xaxis.set_label_coords(0.5, -0.17 / self.strip_height)
         bar.ax.tick_params(labelsize=7.5, length=2, pad=1.5)
         bar.ax.minorticks_off()
         if ticks:

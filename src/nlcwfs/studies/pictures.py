@@ -80,7 +80,7 @@ def draw_reconstruction(frames: FramesFile, wavefront: WavefrontFile, number: in
     if frames.truth_m is not None:
         truth_m = frames.truth_m if frames.truth_m.ndim == 2 else frames.truth_m[number]
     letters = _letters()
-    board = Board(rows=3, columns=max(4, frames.electrons.shape[1]))
+    board = Board(rows=3, columns=max(3 if truth_m is None else 4, frames.electrons.shape[1]))
     _draw_frames(board, frames, number, letters)
     _draw_residuals(board, frames, wavefront, number, letters)
     opd_m, width_m = wavefront.opd_m[number], frames.pixel_m
@@ -88,14 +88,15 @@ def draw_reconstruction(frames: FramesFile, wavefront: WavefrontFile, number: in
     image = _draw_pupil(panel, opd_m * 1e9, width_m, HEIGHT, None)
     _title(panel, f"({next(letters)}) wavefront, {wavefront.rms_nm[number]:.0f} nm rms")
     board.bar(image, 2, 0, "optical path difference, nm")
-    _draw_star(board, 1, "star before", opd_m if truth_m is None else truth_m, frames, letters)
     if truth_m is None:
         phase_rad = np.angle(np.exp(2j * np.pi / frames.wavelength_m * opd_m))
-        panel = board.panel(2, 2)
+        panel = board.panel(2, 1)
         image = _draw_pupil(panel, phase_rad, width_m, PHASE, np.pi)
         _title(panel, f"({next(letters)}) the same, wrapped")
-        board.bar(image, 2, 2, f"phase at {_um(frames.wavelength_m)}, rad", ticks=PHASE_TICKS)
+        board.bar(image, 2, 1, f"phase at {_um(frames.wavelength_m)}, rad", ticks=PHASE_TICKS)
+        _draw_star(board, 2, "star behind it", opd_m, frames, letters)
         return board.figure
+    _draw_star(board, 1, "star before", truth_m, frames, letters)
     error_m = truth_m - opd_m
     error_m = error_m - np.nanmean(error_m)
     panel = board.panel(2, 2)
