@@ -35,7 +35,7 @@ pytest: $(VENV)/.installed-dev  ## Tests and the examples in the docstrings
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q
 
 studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that take minutes
-	$(BIN)/nlcwfs study 01-single-frame
+	$(BIN)/nlcwfs study studies/01-single-frame
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs

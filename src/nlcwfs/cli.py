@@ -125,6 +125,27 @@ def figure(
     draw_figure(name, out, seed=seed, overrides=settings or [])
 
 
+@app.command()
+@mendable
+def study(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Holds study.toml, such as studies/01-single-frame.")
+    ],
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="START", help="Only cases whose names start so; repeatable.")
+    ] = None,
+    screens: Annotated[int | None, typer.Option(min=1, help="Fewer screens, for a quick look.")] = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Run what the table of a study does not hold yet, draw its figures and write its page.
+
+    Each case is on disk as soon as it is done; an interrupted study goes on where it was.
+    """
+    from nlcwfs.commands.study import study as run
+
+    run(folder, only=tuple(only or ()), screens=screens, quiet=quiet)
+
+
 def main() -> None:
     """Entry point of the command `nlcwfs`."""
     try:

@@ -24,13 +24,13 @@ MANY_PARAMETERS = {
     "curvature_sensor/defocused_images.py:build": "the seven things a sensor is made of, four of them optional",
     "estimation/amplitude_constraint.py:modulus_factor": "noise, doubt and a mean known already are options",
     "estimation/ladder.py:_level": "fills a record; private",
-    "estimation/reconstructor.py:problem_at": "fills a record",
+    "estimation/gerchberg_saxton.py:problem_at": "fills a record",
 }
 SELF_EVIDENT = 8  # lines: a function so short is its own example
 WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:window_costs": "its example is that of the estimate it belongs to",
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
-    "nlcwfs.estimation.reconstructor:problem_at": "fills a record from a level",
+    "nlcwfs.estimation.gerchberg_saxton:problem_at": "fills a record from a level",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",

@@ -17,7 +17,7 @@ from nlcwfs.estimation import gerchberg_saxton as gs
 from nlcwfs.estimation.amplitude_constraint import LARGEST_FACTOR, modulus_factor
 from nlcwfs.estimation.angle import angle, cosine_and_sine, wrap
 from nlcwfs.estimation.centroid_tilt import centroid_tilt
-from nlcwfs.estimation.reconstructor import GerchbergSaxton, problem_at
+from nlcwfs.estimation.reconstructor import GerchbergSaxton
 from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
@@ -132,7 +132,7 @@ def plain_step(shape: tuple[int, int], planes: int, scheme: str):
         level, options = with_pupil(solver.levels[-1], pupil), solver.settings.gerchberg_saxton
         measured = Measurement(counts, jnp.ones(counts.shape, bool), jnp.asarray(0.0))
         flat, first, strength = jnp.zeros(shape), jnp.asarray(0), jnp.asarray(1.0)
-        problem = problem_at(level, measured, options, flat, first, strength, None)
+        problem = gs.problem_at(level, measured, options, flat, first, strength, None)
         return gs.step(problem._replace(gain=gain), options, gs.init(phase_rad)).phase_rad
 
     return jax.jit(one)

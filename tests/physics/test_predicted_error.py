@@ -9,7 +9,7 @@ import pytest
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.estimation import gerchberg_saxton as gs
-from nlcwfs.estimation.reconstructor import GerchbergSaxton, problem_at
+from nlcwfs.estimation.reconstructor import GerchbergSaxton
 from nlcwfs.estimation.resolution_level import Measurement
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
@@ -68,7 +68,7 @@ def test_the_count_of_ffts_is_what_the_program_holds(scheme, kind, which):
     shape = (3, *level.measured_shape)
     measured = Measurement(jnp.ones(shape, "float32"), jnp.ones(shape, bool), jnp.asarray(0, "float32"))
     flat, one = jnp.zeros(level.grid.shape, "float32"), jnp.asarray(1, "float32")
-    problem = problem_at(level, measured, options, flat, jnp.asarray(0), one, jnp.ones(level.grid.shape, "float32"))
+    problem = gs.problem_at(level, measured, options, flat, jnp.asarray(0), one, jnp.ones(level.grid.shape, "float32"))
     program = jax.make_jaxpr(lambda phase: gs.step(problem, options, gs.init(phase)).phase_rad)(flat)
     blurs = level.structures is not None
     assert ffts_in(program.jaxpr) == gs.ffts_per_iteration(3, options, blurs=blurs)

@@ -247,7 +247,7 @@ class GerchbergSaxton(eqx.Module):
             unexplained=unexplained,
             residual=jnp.stack([_cropped(plane, self.geometry.frame.shape) for plane in residual]),
             iterations=climb.iterations,
-            ffts=climb.ffts + 2 * measured.counts.shape[0] + 1 + slip_ffts,
+            ffts=climb.ffts + 3 * measured.counts.shape[0] + 1 + slip_ffts,
             outcome_code=verdict(
                 unexplained=unexplained,
                 believed=BELIEVED[self.settings.gerchberg_saxton.filter],

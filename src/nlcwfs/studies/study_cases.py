@@ -38,11 +38,25 @@ class Case(BaseModel):
 
 
 class Study(BaseModel):
-    """A question, what all its cases share, and the cases."""
+    """A question, what all its cases share, and the cases.
+
+    Attributes:
+        question: What is asked.
+        answer: The first line of its page, written when the table is there.
+        notes: The end of its page.
+        groups: Heading of each group of cases.
+        screens: Screens of a case, unless it says otherwise.
+        captured_nm: Error below which a screen counts as captured.
+        set: Settings that all cases share.
+        case: The cases.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     question: str
+    answer: str = "Not answered yet"
+    notes: str = ""
+    groups: dict[str, str] = {}
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
     set: tuple[str, ...] = ()
