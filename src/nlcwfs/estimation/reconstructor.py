@@ -31,8 +31,8 @@ TYPICAL_SEEING_ARCSEC = 0.6
 FIRST_STRENGTH_AT_FRIED = 0.1
 """Unknown turbulence starts as if r0 were a tenth of the telescope: weak enough to be captured."""
 
-SENSOR_LOSS = 2.0
-"""A sensor of speckles needs about twice the photons of the quantum limit, 1 / (4 N) rad^2 (study 01)."""
+SENSOR_LOSS = 3.0
+"""Photons that these sensors need over the quantum limit, 1 / (4 N) rad^2: 2.7 to 3.5 in study 01 (`sensor_loss`)."""
 
 
 class GerchbergSaxton(eqx.Module):
