@@ -48,7 +48,10 @@ def run_demo(folder: Path, *, seed: int) -> int:
     for line in case_lines(case)[:2]:
         say(line)
     say(f"Wrote {picture}.")
-    say(f"\nError of the wavefront: {case.found.error_nm:.1f} nm rms (the paper: 34.4 nm for one frame).")
+    say(
+        f"\nError of the wavefront: {case.residual_rms_nm:.1f} nm rms, scored on the grid of the light "
+        "(the paper: 34.4 nm, one frame)."
+    )
     say(
         "\nWhat next:\n"
         f"  look at {picture}, and at {wavefront} in ds9\n"

@@ -128,7 +128,7 @@ def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot],
         f"Light: {config.atmosphere.photons:g} photons in one exposure at {colour}; "
         f"{electrons:.0f} electrons were read.",
         f"Air: D/r0 = {ratio:.1f} at {colour}; seeing {frames.seeing_arcsec:.2g} arcsec at 0.5 um.",
-        f"True wavefront: {np.sqrt(np.mean(np.square(rms_nm))):.0f} nm rms, tilt included{spread}.",
+        f"True wavefront: {np.sqrt(np.mean(np.square(rms_nm))):.0f} nm rms on these pixels, tilt included{spread}.",
         f"Light outside the window: {', '.join(percent(float(share)) for share in lost)} of planes 1 to {planes}.",
         *([f"Static aberration: {static_nm:g} nm rms; TRUTH holds it, too."] if static_nm else []),
         f"The light travels on {simulator.light.shape[0]} x {simulator.light.shape[1]} cells, "
