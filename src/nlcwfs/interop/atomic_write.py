@@ -37,6 +37,13 @@ def check_writable(path: str | Path) -> None:
         raise FileFormatError(f"{path}: output folder must be writable, got the read-only {folder}")
     if path.exists() and not os.access(path, os.W_OK):
         raise FileFormatError(f"{path}: output must be writable, got a read-only file")
+    trial = _beside(path)
+    try:  # permissions do not tell everything: read-only file systems, quotas, special folders
+        trial.touch()
+    except OSError as error:
+        raise FileFormatError(f"{path}: output folder must be writable, got {error.strerror}") from None
+    finally:
+        trial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -62,7 +69,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     check_writable(path)
-    temporary = path.with_name(f".{secrets.token_hex(4)}-{path.name}")
+    temporary = _beside(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -70,3 +77,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise FileFormatError(f"{path}: cannot be written, got {error.strerror or error}") from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    """A name in the same folder that nobody else has, with the same ending."""
+    return path.with_name(f".{secrets.token_hex(4)}-{path.name}")

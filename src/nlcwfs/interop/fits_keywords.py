@@ -61,7 +61,8 @@ def load_hdus(path: str | Path) -> dict[str, Hdu]:
                     name = hdu.name.strip().upper() if number else "PRIMARY"
                     parts.setdefault(name or f"HDU {number}", Hdu(hdu.header, hdu.data))
     except Exception as error:  # astropy raises errors of many kinds on damaged bytes
-        raise file_error(path, "file", "must be readable as FITS", error) from None
+        # The first sentence tells what is wrong; astropy's advice after it is for programmers.
+        raise file_error(path, "file", "must be readable as FITS", str(error).split(". If this", 1)[0]) from None
     return parts
 
 
