@@ -30,10 +30,14 @@ SELF_EVIDENT = 8  # lines: a function so short is its own example
 WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:window_costs": "its example is that of the estimate it belongs to",
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
-    "nlcwfs.estimation.gerchberg_saxton:problem_at": "fills a record from a level",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
+    "nlcwfs.studies.study_cases:read_study": "needs a folder; `nlcwfs study` shows it",
+    "nlcwfs.studies.study_run:build_solver": "needs a study",
+    "nlcwfs.studies.study_run:make_light": "needs a study",
+    "nlcwfs.studies.study_run:run_case": "needs a study",
+    "nlcwfs.studies.study_run:run_study": "needs a folder, and minutes",
 }
 
 
