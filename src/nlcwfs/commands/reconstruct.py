@@ -202,8 +202,7 @@ def header_lines(frames: FramesFile, reconstructor: FramesReconstructor, *, alre
     electrons = np.median(reconstructor.photo_electrons[usable].sum(axis=(1, 2, 3)))
     masked = int(frames.masked.sum())
     seeing = reconstructor.settings.seeing_arcsec
-    source = "SEEING of the header" if seeing == frames.seeing_arcsec else "estimation.seeing_arcsec"
-    prior = "measured from each frame" if seeing is None else f"seeing {seeing:.2g} arcsec ({source})"
+    prior = "measured from each frame" if seeing is None else f"seeing {seeing:.2g} arcsec (estimation.seeing_arcsec)"
     return [
         f"Frames: {count} of {planes} planes of {rows} x {columns} pixels, {frames.diameter_m / frames.pixel_m:.3g} "
         f"across the pupil; {electrons:.0f} electrons in a frame{f', {masked} pixels masked' if masked else ''}.",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from nlcwfs.interop import atomic_write
 from nlcwfs.studies.study_table import Row, StudyTable
@@ -35,7 +36,7 @@ def draw_figures(folder: Path, table: StudyTable) -> dict[str, str]:
         _save(_convergence(table), folder / "convergence.png")
         captions["convergence.png"] = (
             "Captured screens and median error against the FFTs of one plane: D/r0 = 8.2, 2e4 photons, 45 pixels, "
-            "light on a grid four times finer. Whole-dashed line: photon bound for the same light."
+            "light on a grid four times finer. Dashed line: photon bound (Bayesian Cramer-Rao) for the same light."
         )
     if {"photons", "rms"} <= groups:
         _save(_light_and_turbulence(table), folder / "photons-and-turbulence.png")
@@ -77,8 +78,7 @@ def _convergence(table: StudyTable) -> Figure:
     left.set_ylabel("screens below 60 nm [%]")
     left.set_ylim(0, 102)
     right.set_ylabel("median error of all screens [nm]")
-    right.set_yscale("log")
-    right.set_yticks([20, 30, 50, 100, 200, 500], ["20", "30", "50", "100", "200", "500"])
+    _log_nm(right, (20, 30, 50, 100, 200))
     bound = [float(row["bound_nm"]) for row in table.rows if row["case"] == "paper-8.2"]
     if bound and np.isfinite(bound[0]):
         right.axhline(bound[0], color="gray", linestyle="--", linewidth=1)
@@ -104,9 +104,8 @@ def _light_and_turbulence(table: StudyTable) -> Figure:
         _curve(right, rows, at_nm, color, label)
     right.set_xlabel("mean rms of the wavefront, tilt included [nm]")
     for axes in (left, right):
-        axes.set_yscale("log")
         axes.set_ylabel("error [nm rms]")
-        axes.set_yticks([10, 20, 30, 50, 100, 200, 300], ["10", "20", "30", "50", "100", "200", "300"])
+        _log_nm(axes, (5, 10, 20, 30, 50, 100, 200))
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
     return figure
@@ -122,6 +121,13 @@ def _curve(axes: Axes, rows: Sequence[Row], at: np.ndarray, color: str, label: s
     known = np.isfinite(bound)
     if known.any():
         axes.plot(at[known], bound[known], color=color, linestyle="--", linewidth=1)
+
+
+def _log_nm(axes: Axes, ticks: Sequence[int]) -> None:
+    """A logarithmic axis with plain numbers at these places only."""
+    axes.set_yscale("log")
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_yticks(ticks, [str(tick) for tick in ticks])
 
 
 def _column(rows: Sequence[Row], name: str) -> np.ndarray:
