@@ -13,14 +13,18 @@ PENDING = "The table of this study is not stored yet: `make studies` computes it
 
 
 def write_pages(docs: Path) -> None:
-    """Copy the README of each study, one heading level lower, to where a page of the docs includes it.
+    """Copy the README of each study, one heading level lower, with its pictures, to where a page includes it.
 
-    A study that is not stored yet becomes a sentence that says so. Pictures are left out: they stand in the
-    study's own folder.
+    A study that is not stored yet becomes a sentence that says so.
     """
     for name in STUDIES:
-        readme = docs.parent / "studies" / name / "README.md"
+        folder = docs.parent / "studies" / name
+        readme = folder / "README.md"
         text = _lowered(readme.read_text()) if readme.exists() else PENDING
+        for picture in sorted(folder.glob("*.png")):
+            kept = f"study-{name}-{picture.name}"
+            _write(docs / "_generated" / kept, picture.read_bytes())
+            text = text.replace(f"]({picture.name})", f"](_generated/{kept})")
         _write(docs / "_generated" / f"study-{name}.md", text)
 
 
@@ -46,17 +50,16 @@ def write_command_line(docs: Path) -> None:
     _write(docs / "_generated" / "command-line.md", "\n".join(parts))
 
 
-def _write(target: Path, text: str) -> None:
+def _write(target: Path, content: str | bytes) -> None:
+    data = content.encode() if isinstance(content, str) else content
     target.parent.mkdir(exist_ok=True)
-    if not target.exists() or target.read_text() != text:  # an unchanged page is not built again
-        target.write_text(text)
+    if not target.exists() or target.read_bytes() != data:  # an unchanged page is not built again
+        target.write_bytes(data)
 
 
 def _lowered(text: str) -> str:
     lines, in_code = [], False
     for line in text.splitlines():
         in_code ^= line.startswith("```")
-        if line.startswith("![") and not in_code:
-            continue
         lines.append(f"#{line}" if line.startswith("#") and not in_code else line)
     return "\n".join(lines) + "\n"
