@@ -52,8 +52,9 @@ def unexplained_share(
     missed = blurred(counts - jnp.where(usable, model, 0), factor)
     # A pixel of variance 1 leaves the mean of the filter's squared modulus (Parseval).
     passed = jnp.mean(_whole_plane(band, model.shape[2]) ** 2)
-    single = jnp.where(usable, jnp.maximum(counts, 0) + measurement.read_variance, 0)
-    noise = passed * jnp.mean(single, axis=(1, 2))
+    single = jnp.where(usable, counts + measurement.read_variance, 0)
+    # Negative pixels count as they are: without them read noise would pass for light, and its noise for known.
+    noise = passed * jnp.maximum(jnp.mean(single, axis=(1, 2)), 0)
     speckles = jnp.mean(seen**2, axis=(1, 2)) - noise
     # The variance of noise is known from about as many independent samples as the filter passes.
     doubt = VISIBLE * noise * jnp.sqrt(2 / (passed * seen[0].size))
