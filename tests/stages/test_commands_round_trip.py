@@ -94,7 +94,9 @@ def test_tilt_and_coma_come_back_the_right_way_round(tmp_path):
         return 60e-9 * 2 * x - 30e-9 * 2 * y + 40e-9 * np.sqrt(8) * (3 * (x**2 + y**2) - 2) * y
 
     given_frames(tmp_path / "f.fits", wavefront)
-    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits")
+    # Bright and nearly flat on pixels of 33 cm: the strength would be measured from the model's own errors.
+    seeing = fits.getheader(tmp_path / "f.fits")["SEEING"]
+    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits", "--set", f"estimation.seeing_arcsec={seeing}")
     with fits.open(tmp_path / "w.fits") as hdus:
         opd_m, modes = hdus[0].data, hdus["MODES"].data
         coefficient = dict(zip(modes["noll"], modes["coefficient_m"], strict=True))
@@ -114,7 +116,8 @@ def test_the_sigma_of_the_modes_is_that_of_the_photons(tmp_path):
     with fits.open(tmp_path / "w.fits") as hdus:
         modes = hdus["MODES"].data
     electrons = fits.getdata(tmp_path / "f.fits").sum()
-    one_mode_m = np.sqrt(2) / (2 * np.sqrt(electrons)) * 0.65e-6 / (2 * np.pi)
+    # The sensor needs about three times the photons of the quantum limit, 1 / (2 sqrt(N)) rad (study 01: 2.7 to 3.5).
+    one_mode_m = np.sqrt(3) / (2 * np.sqrt(electrons)) * 0.65e-6 / (2 * np.pi)
     np.testing.assert_allclose(modes["sigma_m"][1:6], one_mode_m, rtol=0.15)  # 24 pixels cut the rim of a disc
     # Zernikes are fitted together: towards the last ones they are told apart less and less well.
     assert np.all(modes["sigma_m"] > 0.95 * one_mode_m)
