@@ -95,7 +95,7 @@ def run_study(
             lights[kind] = make_light(case, config, count, progress)
         row = run_case(case, config, study.captured_nm, lights[kind], progress)
         row |= _bound_columns(case, config, bounds)
-        table.put({"case": case.name, "group": case.group} | row | {"digest": digest}, stamp)
+        table.put({"case": case.name, "group": case.group} | row | {"commit": stamp.commit, "digest": digest}, stamp)
     if not only and table.rows:
         table.sort([case.name for case in study.case], stamp)
     return table
