@@ -83,7 +83,7 @@ def _convergence(table: StudyTable) -> Figure:
     if bound and np.isfinite(bound[0]):
         right.axhline(bound[0], color="gray", linestyle="--", linewidth=1)
         right.annotate("photon bound", (0.02, bound[0] * 1.03), xycoords=("axes fraction", "data"), color="gray")
-    right.legend(fontsize=8, frameon=False)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
@@ -99,7 +99,8 @@ def _light_and_turbulence(table: StudyTable) -> Figure:
     left.set_xlabel("photons in the exposure")
     rms = [row for row in table.rows if row["group"] == "rms"]
     for color, plain, label in (("C0", False, "default, 45 pixels"), ("C2", True, "plain GS, 45 pixels")):
-        rows = [row for row in rms if str(row["case"]).endswith("-plain") == plain]
+        ending = ["plain"] if plain else []
+        rows = [row for row in rms if str(row["case"]).split("-")[2:] == ending]
         at_nm = np.array([float(str(row["case"]).split("-")[1]) for row in rows])
         _curve(right, rows, at_nm, color, label)
     right.set_xlabel("mean rms of the wavefront, tilt included [nm]")
