@@ -97,7 +97,8 @@ def read_study(folder: Path) -> Study:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise FileFormatError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}") from None
+        got = "nothing" if first["type"] == "missing" else repr(first["input"])
+        raise FileFormatError(f"{path}: {where}: {first['msg']}, got {got}") from None
     names = [case.name for case in study.case]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
