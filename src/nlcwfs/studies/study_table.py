@@ -38,8 +38,10 @@ class StudyTable:
     def sort(self, names: list[str], provenance: Provenance) -> None:
         """Bring the rows into the order of the study; rows of cases that no longer exist go."""
         order = {name: number for number, name in enumerate(names)}
-        self.rows = sorted((row for row in self.rows if row["case"] in order), key=lambda row: order[str(row["case"])])
-        self._write(provenance)
+        rows = sorted((row for row in self.rows if row["case"] in order), key=lambda row: order[str(row["case"])])
+        if rows != self.rows:  # a table that was left as it is keeps the stamp of who made it
+            self.rows = rows
+            self._write(provenance)
 
     def _write(self, provenance: Provenance) -> None:
         columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
