@@ -18,6 +18,7 @@ from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
+from nlcwfs.detector.read import Detector
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import GerchbergSaxton
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
@@ -161,7 +162,7 @@ def run_case(case: Case, config: Config, captured_nm: float, light: Light, progr
     """Reconstruct all the screens of a case and sum up."""
     solver, frame = build_solver(case, config)
     camera = config.detector
-    read_variance = camera.read_noise_electrons**2 / camera.em_gain**2 + camera.dark_electrons
+    read_variance = camera.read_noise_electrons**2 / camera.em_gain**2 + Detector(camera).background_electrons
 
     @eqx.filter_jit
     def reconstruct(solver: GerchbergSaxton, counts: Float[Array, "plane y x"]):
