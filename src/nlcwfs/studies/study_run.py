@@ -80,7 +80,9 @@ def run_study(
     study = read_study(folder)
     configs = {case.name: study.config_of(case) for case in study.case}
     table = StudyTable(folder / "results.ecsv")
-    stamp = Provenance.collect(study.model_dump(mode="json"), seed=0, device=jax.devices()[0].device_kind)
+    seeds = {config.seed for config in configs.values()}
+    seed = seeds.pop() if len(seeds) == 1 else None  # cases may each have their own: it is in their settings
+    stamp = Provenance.collect(study.model_dump(mode="json"), seed=seed, device=jax.devices()[0].device_kind)
     lights: dict[str, Light] = {}
     bounds: dict[str, LightInformation] = {}
     for case in study.case:
