@@ -84,6 +84,25 @@ def test_only_whole_turns_are_taken_and_piston_goes_along(seed, rms_rad, piston_
     assert np.mean(abs(raised - found - piston_rad) > RAD_ROUNDING) < 1e-3
 
 
+def test_groups_of_two_turns_side_by_side_come_back():
+    """Found at 2e6 photons: up and down beside each other; what pulls at its neighbours has to go first."""
+    found = """
+        ..+++.......
+        -.+2+.......
+        ..+2.--.....
+        ....-==-....
+        ..---==-...-
+        ...--==-...-
+        .....--.....
+    """
+    worth = {".": 0, "+": 1, "2": 2, "-": -1, "=": -2}
+    turns = np.zeros(PIXELS.shape)
+    turns[10:17, 28:40] = [[worth[sign] for sign in line] for line in found.split()]
+    for rms_rad in (0.0, 5.0):
+        phase_rad = smooth_phase(3, rms_rad)
+        np.testing.assert_allclose(mended(phase_rad + TURN * turns), phase_rad, atol=RAD_ROUNDING)
+
+
 def test_a_step_wider_than_the_filter_stays():
     """A segment may be a turn off, and nobody can tell: it is not for the filter to move it."""
     y, x = np.indices(PIXELS.shape)
