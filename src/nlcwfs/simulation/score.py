@@ -27,10 +27,10 @@ def wavefront_error_m(
         light: Grid of the light, with the same centre.
 
     Examples:
-        >>> frame, light = Grid((8, 8), 1.0), Grid((16, 16), 0.5)
-        >>> coarse = np.broadcast_to(frame.x_m, (8, 8)) * 1e-7 + 5.0
-        >>> fine = np.broadcast_to(light.x_m, (16, 16)) * 1e-7
-        >>> middle = np.pad(np.full((8, 8), 1 / 64), 4)
+        >>> frame, light = Grid((24, 24), 1.0), Grid((48, 48), 0.5)
+        >>> coarse = np.broadcast_to(frame.x_m, (24, 24)) * 1e-7 + 5e-6
+        >>> fine = np.broadcast_to(light.x_m, (48, 48)) * 1e-7
+        >>> middle = np.pad(np.full((8, 8), 1 / 64), 20)
         >>> wavefront_error_m(coarse, frame, fine, middle, light) < 1e-12
         True
     """
