@@ -25,6 +25,7 @@ from nlcwfs.estimation.angle import angle, cosine_and_sine
 from nlcwfs.estimation.reconstructor import GerchbergSaxton
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
+from nlcwfs.estimation.whole_turns import PASSES
 
 GEOMETRY = SensorGeometry(
     pupil=PupilShape(diameter_m=8.0),
@@ -49,7 +50,7 @@ def times_ms(function, *arguments) -> np.ndarray:
 
 
 def own_ffts(settings: GerchbergSaxtonSettings):
-    """The FFTs of ten iterations and of the closing comparison with the counts, and nothing else."""
+    """The FFTs of ten iterations and of the closing comparison with the counts, in the same number and shape."""
     shape = GEOMETRY.frame.shape
     planes = len(GEOMETRY.distances_m)
     at_once = planes if settings.scheme == "averaged" else 1
@@ -64,9 +65,18 @@ def own_ffts(settings: GerchbergSaxtonSettings):
                 field = jax.lax.complex(smooth, field.imag)
         return field
 
+    def there_and_back(real, times):
+        for _ in range(times):
+            real = jnp.fft.irfft2(jnp.fft.rfft2(real), s=shape)
+        return real
+
     def run(field):
         field = jax.lax.fori_loop(0, settings.iterations, iteration, field)
-        return jnp.fft.ifft2(jnp.broadcast_to(jnp.fft.fft2(field)[None], (planes, *shape)))
+        far = jnp.fft.ifft2(jnp.broadcast_to(jnp.fft.fft2(field)[None], (planes, *shape)))
+        # The verdict filters counts and residual; the default also smooths the counts and brings slips back.
+        frames = there_and_back(far.real, 2 + (settings.amplitude == "poisson"))
+        phase = there_and_back(field.real, PASSES if settings.filter == "turbulence" else 0)
+        return frames, phase
 
     return jax.jit(run)
 
