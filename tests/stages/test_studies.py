@@ -34,7 +34,7 @@ SLOPES = ["estimation.unwrapping=slopes", "estimation.modes=20"]
 SHORT = """question = "Does it run?"
 answer = "It runs"
 screens = 3
-set = ["seed=5"]
+set = ["seed=5", "atmosphere.photons=3e4"]
 
 [groups]
 few = "A few cases"
@@ -78,7 +78,7 @@ def test_a_study_says_what_it_asks(tmp_path):
     assert [study.screens_of(case) for case in study.case] == [3, 3, 2]
     configs = [study.config_of(case) for case in study.case]
     assert {config.seed for config in configs} == {5}
-    assert [config.atmosphere.photons for config in configs] == [2e4, 2e4, 1e6]
+    assert [config.atmosphere.photons for config in configs] == [3e4, 3e4, 1e6]  # a case overrules the study
     assert [config.estimation.gerchberg_saxton.gain for config in configs] == [1.5, 1.0, 1.5]
 
 
@@ -408,6 +408,12 @@ def stored_cases(folder) -> list[str]:
 def test_cases_of_the_same_light_share_it(tmp_path, bench):
     assert bench.ran(written(tmp_path)) == ["a-default", "b-known", "a-bright"]
     assert bench.lights == [("a-default", 3), ("a-bright", 2)]
+    more = SHORT.replace('strength = "known"', 'strength = "known"\nscreens = 4')
+    bench.ran(written(tmp_path / "more", more))
+    assert bench.lights == [("a-default", 3), ("b-known", 4), ("a-bright", 2)]
+    matched = SHORT.replace('strength = "known"', 'light = "matched"')
+    bench.ran(written(tmp_path / "matched", matched))
+    assert bench.lights == [("a-default", 3), ("b-known", 3), ("a-bright", 2)]
 
 
 def test_an_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path, bench):
@@ -456,14 +462,16 @@ def test_cases_that_differ_in_photons_alone_share_the_information(tmp_path, benc
     asked, nothing = [], LightInformation([], None)
     monkeypatch.setattr(study_run, "light_information", lambda config: asked.append(config) or nothing)
     monkeypatch.setattr(study_run, "case_bound", lambda config, light: BOUND | {"bound_nm": config.atmosphere.photons})
-    bench.ran(written(tmp_path, SHORT.replace('group = "few"', 'group = "few"\nbound = true', 2)))
-    rows = StudyTable(tmp_path / "results.ecsv").rows
-    assert [row["bound_nm"] for row in rows][:2] == [2e4, 2e4]
-    assert np.isnan([rows[2]["bound_nm"], rows[2]["quantum_nm"], rows[2]["sensor_loss"]]).all()
-    assert len(asked) == 1
     bench.ran(written(tmp_path, SHORT.replace('group = "few"', 'group = "few"\nbound = true')))
-    assert [row["bound_nm"] for row in StudyTable(tmp_path / "results.ecsv").rows] == [2e4, 2e4, 1e6]
-    assert len(asked) == 2
+    assert [row["bound_nm"] for row in StudyTable(tmp_path / "results.ecsv").rows] == [3e4, 3e4, 1e6]
+    assert len(asked) == 1
+    other_seed = SHORT.replace('"atmosphere.photons=1e6"', '"seed=6"')
+    bench.ran(written(tmp_path / "other", other_seed.replace('group = "few"', 'group = "few"\nbound = true')))
+    assert len(asked) == 3
+    bench.ran(written(tmp_path / "none"))
+    assert len(asked) == 3
+    rows = StudyTable(tmp_path / "none" / "results.ecsv").rows
+    assert np.isnan([row[name] for row in rows for name in BOUND]).all()
 
 
 def stamp(folder) -> dict:
