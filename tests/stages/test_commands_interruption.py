@@ -96,6 +96,10 @@ def test_bad_frames_are_left_out_named_and_flagged(tmp_path, frames):
     assert [name == "converged" for name in outcomes(tmp_path / "w.fits")] == [True, False, True, True]
 
 
+def hear_interrupts():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_a_real_ctrl_c_keeps_what_is_done(tmp_path):
     path, out = tmp_path / "f.fits", tmp_path / "w.fits"
     small_frames(path, "--frames", 1)
@@ -104,9 +108,9 @@ def test_a_real_ctrl_c_keeps_what_is_done(tmp_path):
         hdus.writeto(path, overwrite=True)
     command = [sys.executable, "-m", "nlcwfs.cli", "reconstruct", str(path), "--out", str(out)]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # A test run in the background of a shell is deaf to Ctrl-C, and its children inherit that.
+    with subprocess.Popen(command, **pipes, env=environment, preexec_fn=hear_interrupts) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if line.startswith("Compiled"):  # from here on a frame is done in some 10 ms
