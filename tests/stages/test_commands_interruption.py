@@ -96,8 +96,8 @@ def test_bad_frames_are_left_out_named_and_flagged(tmp_path, frames):
     assert [name == "converged" for name in outcomes(tmp_path / "w.fits")] == [True, False, True, True]
 
 
-def hear_interrupts():
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+# A test run in the background of a shell is deaf to Ctrl-C, and its children inherit that: hear it again.
+HEARING = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from nlcwfs.cli import main; main()"
 
 
 def test_a_real_ctrl_c_keeps_what_is_done(tmp_path):
@@ -106,11 +106,10 @@ def test_a_real_ctrl_c_keeps_what_is_done(tmp_path):
     with fits.open(path) as hdus:
         hdus[0].data = np.repeat(hdus[0].data[None], 1000, axis=0)
         hdus.writeto(path, overwrite=True)
-    command = [sys.executable, "-m", "nlcwfs.cli", "reconstruct", str(path), "--out", str(out)]
+    command = [sys.executable, "-c", HEARING, "reconstruct", str(path), "--out", str(out)]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    # A test run in the background of a shell is deaf to Ctrl-C, and its children inherit that.
-    with subprocess.Popen(command, **pipes, env=environment, preexec_fn=hear_interrupts) as process:
+    with subprocess.Popen(command, **pipes, env=environment) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if line.startswith("Compiled"):  # from here on a frame is done in some 10 ms
