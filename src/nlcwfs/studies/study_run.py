@@ -15,15 +15,23 @@ from jaxtyping import Array, Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import modal_basis
+from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
-from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.read import Detector
 from nlcwfs.estimation.outcome import Outcome
-from nlcwfs.estimation.reconstructor import GerchbergSaxton
+from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC, GerchbergSaxton
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.interop import Provenance
-from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, frame_key, wavelength_m
+from nlcwfs.simulation.exposure import (
+    ExposureSimulator,
+    _lit_part,
+    distances_m,
+    frame_key,
+    seeing_arcsec,
+    turbulence,
+    wavelength_m,
+)
 from nlcwfs.simulation.score import wavefront_error_m
 from nlcwfs.studies.case_bound import LightInformation, case_bound, light_information
 from nlcwfs.studies.study_cases import Case, read_study
@@ -107,10 +115,9 @@ def run_study(
 def make_light(case: Case, config: Config, count: int, progress: Progress) -> Light:
     """Expose the detector to `count` skies."""
     simulator = ExposureSimulator.build(config)
-    lit = _lit_part(np.asarray(simulator.weights))
-    cut = (slice(*lit[0]), slice(*lit[1]))
-    grid = Grid((lit[0][1] - lit[0][0], lit[1][1] - lit[1][0]), simulator.light.pixel_m)
+    cut = _lit_part(np.asarray(simulator.weights))
     weights = np.asarray(simulator.weights, float)[cut]
+    grid = simulator.light.padded(weights.shape)
     matched = matched_model(config, simulator) if case.light == "matched" else None
     screens = []
     for number in range(count):
@@ -125,8 +132,7 @@ def make_light(case: Case, config: Config, count: int, progress: Progress) -> Li
         screens.append(Screen(truth_m, counts - simulator.detector.background_electrons))
         progress(f"{case.name}: light", number + 1, count)
     if matched is not None:
-        pupil = np.asarray(matched.pupil, float)
-        return Light(screens, simulator.frame, pupil**2 / np.sum(pupil**2))
+        return Light(screens, simulator.frame, light_weights(np.asarray(matched.pupil)))
     return Light(screens, grid, weights)
 
 
@@ -151,8 +157,7 @@ def build_solver(case: Case, config: Config) -> tuple[GerchbergSaxton, Grid]:
     simulator = ExposureSimulator.build(config)
     geometry, settings = geometry_of(config, simulator), config.estimation
     if case.strength == "known":
-        seeing = SEEING_TO_FRIED * SEEING_WAVELENGTH_M / simulator.air.fried_m / ARCSEC_RAD
-        settings = settings.model_copy(update={"seeing_arcsec": seeing})
+        settings = settings.model_copy(update={"seeing_arcsec": seeing_arcsec(simulator.air)})
     basis = None
     if settings.unwrapping == "slopes":
         pupil = simulator.shape.on(geometry.frame)
@@ -209,11 +214,12 @@ def _summary(error_nm: Float[np.ndarray, " screen"], captured_nm: float) -> Row:
 
 
 def _sky_columns(case: Case, config: Config, strengths: list[float]) -> Row:
-    simulator = ExposureSimulator.build(config)
-    telescope_over_fried = config.beam.diameter_m / simulator.air.fried_at(wavelength_m(config))
+    air = turbulence(config)
+    telescope_over_fried = config.beam.diameter_m / air.fried_at(wavelength_m(config))
     options = config.estimation.gerchberg_saxton
-    true_seeing = SEEING_TO_FRIED * SEEING_WAVELENGTH_M / simulator.air.fried_m / ARCSEC_RAD
-    reference = config.estimation.seeing_arcsec or (true_seeing if case.strength == "known" else 0.6)
+    true_seeing = seeing_arcsec(air)
+    untold = true_seeing if case.strength == "known" else TYPICAL_SEEING_ARCSEC
+    reference = config.estimation.seeing_arcsec or untold
     return {
         "telescope_over_fried": round(telescope_over_fried, 3),
         "photons": config.atmosphere.photons,
@@ -248,13 +254,3 @@ def _digest(case: Case, config: Config, count: int, captured_nm: float) -> str:
         [case.model_dump(mode="json"), config.model_dump(mode="json"), count, captured_nm], sort_keys=True
     )
     return hashlib.sha256(content.encode()).hexdigest()[:16]
-
-
-def _lit_part(weights: Float[np.ndarray, "Y X"]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns that hold all the light, the centre kept."""
-    found = []
-    for lit in (weights.any(axis=1), weights.any(axis=0)):
-        index = np.flatnonzero(lit)
-        margin = int(min(index[0], lit.size - 1 - index[-1]))
-        found.append((margin, lit.size - margin))
-    return found[0], found[1]
