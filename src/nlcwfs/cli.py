@@ -52,20 +52,28 @@ def demo(
 def simulate(
     config: ConfigArgument = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="FITS file to write.")] = Path("frames.fits"),
-    frames: Annotated[int | None, typer.Option(help="How many exposures, each of another sky.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="How many exposures: each of another sky, or one after the other.")
+    ] = None,
     seed: SeedOption = None,
     settings: SetOption = None,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="Successive exposures of one sky, which the wind moves.")
+    ] = False,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Exposures in a second, with --sequence.")] = None,
     adu: Annotated[bool, typer.Option("--adu", help="Write readings (bias removed) instead of electrons.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate frames of a star, with the true wavefront beside them.
 
-    The light travels on a finer and wider grid than any reconstructor's model.
+    The light travels on a finer and wider grid than any reconstructor's model. In a sequence the true wavefront is
+    its mean over each exposure.
     """
     from nlcwfs.commands.simulate import SimulateOptions, read_config
     from nlcwfs.commands.simulate import simulate as run
 
-    run(read_config(config, settings or [], frames=frames, seed=seed), SimulateOptions(out, adu, quiet))
+    chosen = read_config(config, settings or [], frames=frames, seed=seed, rate_hz=rate, sequence=sequence)
+    run(chosen, SimulateOptions(out, adu, quiet, sequence=sequence))
 
 
 @app.command()

@@ -66,6 +66,7 @@ def plain_toml(settings: BaseModel) -> str:
         frames = 1
         light_oversampling = 4
         light_window = 2.0
+        substeps = 4
     """
     blocks = []
     for path, section in _sections(settings):

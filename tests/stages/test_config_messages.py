@@ -101,9 +101,12 @@ UNKNOWN_KEYS = {
     "wavelength_um = 0.65": "wavelength_um: unknown key, got 0.65; did you mean beam.wavelength_um?",
     "[atmosphere]\ndiameter_m = 8": ("atmosphere.diameter_m: unknown key, got 8; did you mean beam.diameter_m?"),
     # nothing like it
-    "[simulation]\nzzz = 1": ("simulation.zzz: unknown key, got 1; known are frames, light_oversampling, light_window"),
+    "[simulation]\nzzz = 1": (
+        "simulation.zzz: unknown key, got 1; known are frames, light_oversampling, light_window, rate_hz, substeps"
+    ),
     '[simulation]\n"two\\nlines" = 1': (
-        'simulation."two\\nlines": unknown key, got 1; known are frames, light_oversampling, light_window'
+        'simulation."two\\nlines": unknown key, got 1; known are frames, light_oversampling, light_window, rate_hz, '
+        "substeps"
     ),
 }
 

@@ -7,6 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.integrate
+import scipy.special
 from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
@@ -74,6 +76,25 @@ class Turbulence:
         return 0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
 
 
+def mean_rms_m(air: Turbulence, diameter_m: float) -> float:
+    r"""Mean rms of turbulence over a disc, tilt included, piston not.
+
+    :math:`\sigma^2 = \int W(f)\,(1 - (2 J_1(\pi D f) / (\pi D f))^2)\, 2 \pi f\, df` (Noll 1976, sec. 3).
+
+    Examples:
+        >>> air = Turbulence.from_rms(opd_rms_m=609e-9, diameter_m=8.0)
+        >>> bool(abs(mean_rms_m(air, 8.0) / 609e-9 - 1) < 0.005)  # Noll's constants have three digits
+        True
+    """
+    frequency = np.geomspace(1e-15, 1e4, 20000) / diameter_m  # a tilt is carried by very long waves
+    angle = np.pi * diameter_m * frequency
+    piston = (2 * scipy.special.j1(angle) / angle) ** 2
+    # 1 - piston is (angle / 2)^2 for long waves, where the difference has lost its digits.
+    kept = np.where(angle < 1e-3, (angle / 2) ** 2, 1 - piston)
+    density = air.opd_spectrum(frequency) * kept * 2 * np.pi * frequency
+    return math.sqrt(float(scipy.integrate.trapezoid(density * frequency, np.log(frequency))))
+
+
 class PhaseScreens(eqx.Module):
     """Draws independent screens of turbulence on a grid.
 
@@ -94,10 +115,18 @@ class PhaseScreens(eqx.Module):
     low_amplitude_m: Float[Array, " wave"]
     low_waves_y: Complex[Array, "wave y"]
     low_waves_x: Complex[Array, "wave x"]
+    low_frequency_per_m: tuple[tuple[float, float], ...] = eqx.field(static=True)
+    pixel_m: float = eqx.field(static=True)
 
     @classmethod
     def build(
-        cls, turbulence: Turbulence, *, shape: tuple[int, int], pixel_m: float, dtype: str = "float32"
+        cls,
+        turbulence: Turbulence,
+        *,
+        shape: tuple[int, int],
+        pixel_m: float,
+        period: int | None = None,
+        dtype: str = "float32",
     ) -> "PhaseScreens":
         """Precompute the amplitudes of the Fourier series and of the subharmonics.
 
@@ -105,9 +134,15 @@ class PhaseScreens(eqx.Module):
             turbulence: Strength and outer scale.
             shape: Pixels along y and x.
             pixel_m: Width of a pixel.
+            period: Pixels after which the fine structure repeats; twice the larger side of the shape when left out.
             dtype: Precision of the screens.
+
+        Raises:
+            SettingsError: If the fine structure repeats within the shape.
         """
-        period = 2 * max(shape)
+        period = 2 * max(shape) if period is None else period
+        if period < max(shape):
+            raise SettingsError("period", f"must be at least the {max(shape)} pixels of the shape", period)
         step_per_m = 1 / (period * pixel_m)
         frequency = np.fft.fftfreq(period, pixel_m)
         radius = np.hypot(frequency[:, None], frequency[None, :])
@@ -126,6 +161,8 @@ class PhaseScreens(eqx.Module):
             low_amplitude_m=jnp.asarray(low, dtype),
             low_waves_y=jnp.asarray(np.exp(2j * np.pi * low_y[:, None] * y_m), complex_dtype),
             low_waves_x=jnp.asarray(np.exp(2j * np.pi * low_x[:, None] * x_m), complex_dtype),
+            low_frequency_per_m=tuple(zip(low_y.tolist(), low_x.tolist(), strict=True)),
+            pixel_m=pixel_m,
         )
 
     def draw(self, key: PRNGKeyArray) -> Float[Array, "y x"]:
@@ -138,14 +175,23 @@ class PhaseScreens(eqx.Module):
             Optical path difference in metres.
         """
         key_high, key_low = jax.random.split(key)
-        dtype, rows, columns = self.amplitude_m.dtype, self.low_waves_y.shape[1], self.low_waves_x.shape[1]
-        noise = jax.random.normal(key_high, (2, *self.amplitude_m.shape), dtype) * self.amplitude_m[None]
-        high = jnp.fft.fft2(jax.lax.complex(noise[0], noise[1])).real[:rows, :columns]
-        noise = jax.random.normal(key_low, (2, self.low_amplitude_m.size), dtype) * self.low_amplitude_m[None]
-        coefficient = jax.lax.complex(noise[0], noise[1])
+        rows, columns = self.low_waves_y.shape[1], self.low_waves_x.shape[1]
+        high = self.draw_fine(key_high)[:rows, :columns]
+        coefficient = self.draw_low(key_low)
         low = jnp.einsum("w,wy,wx->yx", coefficient, self.low_waves_y, self.low_waves_x).real
         opd_m = high + low
         return opd_m - opd_m.mean()
+
+    def draw_fine(self, key: PRNGKeyArray) -> Float[Array, "Y X"]:
+        """The fine structure alone, over its whole period, beyond which it repeats."""
+        noise = jax.random.normal(key, (2, *self.amplitude_m.shape), self.amplitude_m.dtype) * self.amplitude_m[None]
+        return jnp.fft.fft2(jax.lax.complex(noise[0], noise[1])).real
+
+    def draw_low(self, key: PRNGKeyArray) -> Complex[Array, " wave"]:
+        """Coefficients in metres of the plane waves that are longer; the OPD is the real part of their sum."""
+        dtype = self.amplitude_m.dtype
+        noise = jax.random.normal(key, (2, self.low_amplitude_m.size), dtype) * self.low_amplitude_m[None]
+        return jax.lax.complex(noise[0], noise[1])
 
 
 def _slope_power(

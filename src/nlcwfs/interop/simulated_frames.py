@@ -59,12 +59,20 @@ class Shot:
         )
 
 
-def frames_of(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot]) -> FramesFile:
+def frames_of(
+    config: Config, simulator: ExposureSimulator, shots: Sequence[Shot], *, rate_hz: float | None = None
+) -> FramesFile:
     """The frames with all that their header says, the pupil and the truth included.
 
     The truth is the wavefront that reaches the planes: a static aberration of the sensor is part of it, because a
     file of frames has no place for it. Gain, read noise and saturation are those at the input of the
     multiplication register, like the electrons.
+
+    Args:
+        config: The settings.
+        simulator: What made the exposures.
+        shots: The exposures, in the order of time if they are a sequence.
+        rate_hz: Exposures in a second of a sequence, each as long as it can be; None for independent ones.
 
     Examples:
         >>> from nlcwfs.config import load_config
@@ -93,6 +101,8 @@ def frames_of(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot
         read_noise_electrons=math.sqrt(float(detector.variance_electrons(jnp.zeros(())))),
         dark_electrons=camera.dark_electrons,
         saturation_electrons=_saturation(detector),
+        exposure_s=None if rate_hz is None else 1 / rate_hz,
+        rate_hz=rate_hz,
         flux_fractions=config.curvature_sensor.flux_fractions,
         seeing_arcsec=seeing_arcsec(simulator.air),
         pupil=simulator.shape.on(grid),

@@ -8,11 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
-import scipy.integrate
-import scipy.special
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
+from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import Spiders, light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
@@ -32,7 +30,8 @@ class Exposure(eqx.Module):
     """What happened in one exposure, and what the detector made of it; batches carry a leading frame axis.
 
     Attributes:
-        opd_m: The star's wavefront on the grid of the light, zero mean over the pupil and zero outside.
+        opd_m: The star's wavefront on the grid of the light, zero mean over the pupil and zero outside; where the air
+            moves, its mean over the exposure.
         photons: Mean photons on every detector pixel, without background.
         frames: What the detector read.
         truth_m: Mean of `opd_m` over the light of every detector pixel; NaN where there is none.
@@ -137,7 +136,7 @@ class ExposureSimulator(eqx.Module):
             key: Random key of this frame, see `frame_key`.
         """
         key_sky, key_detector = jax.random.split(key)
-        return self.expose_to(self._wavefront(key_sky), key_detector)
+        return self.expose_to(self.on_light(self.screens.draw(key_sky)), key_detector)
 
     @eqx.filter_jit
     def expose_to(self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray) -> Exposure:
@@ -147,9 +146,22 @@ class ExposureSimulator(eqx.Module):
             opd_m: Wavefront on the grid of the light; what lies outside the pupil, and piston, do not count.
             key: Random key of the detector's noise.
         """
+        opd_m = self.levelled(opd_m)
+        return self.read(opd_m, self.sensor.images(opd_m, self.photons).photons, key)
+
+    def levelled(self, opd_m: Float[Array, "Y X"]) -> Float[Array, "Y X"]:
+        """A wavefront without its piston and without what lies outside the pupil."""
         opd_m = opd_m.astype(self.weights.dtype)
-        opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
-        planes = self.sensor.images(opd_m, self.photons).photons
+        return jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
+
+    def read(self, opd_m: Float[Array, "Y X"], planes: Float[Array, "plane Y X"], key: PRNGKeyArray) -> Exposure:
+        """Let the detector read light that is already on the planes.
+
+        Args:
+            opd_m: Wavefront that made the light, levelled; it only goes into the record.
+            planes: Photons on the grid of the light.
+            key: Random key of the detector's noise.
+        """
         photons = integrate_on_pixels(planes, factor=self.factor, window=self.window)
         return Exposure(
             opd_m=opd_m,
@@ -166,11 +178,10 @@ class ExposureSimulator(eqx.Module):
         lit = light > SMALLEST_LIGHT * jnp.max(light)
         return jnp.where(lit, weighted / jnp.where(lit, light, 1), jnp.nan)
 
-    def _wavefront(self, key: PRNGKeyArray) -> Float[Array, "Y X"]:
-        """A screen on the whole grid, zero where there is no pupil."""
-        drawn = self.screens.draw(key)
-        margins = [((whole - part) // 2,) * 2 for whole, part in zip(self.light.shape, drawn.shape, strict=True)]
-        return jnp.pad(drawn, margins)
+    def on_light(self, opd_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "Y X"]:
+        """A wavefront on the part of the grid that holds the pupil, zero around it."""
+        margins = [((whole - part) // 2,) * 2 for whole, part in zip(self.light.shape, opd_m.shape, strict=True)]
+        return jnp.pad(opd_m, margins)
 
 
 def frame_key(*, seed: int, frame: int) -> PRNGKeyArray:
@@ -227,25 +238,6 @@ def turbulence(config: Config) -> Turbulence:
     calmer = dataclasses.replace(air, outer_scale_m=outer_scale_m)
     missing = mean_rms_m(calmer, diameter_m) / mean_rms_m(air, diameter_m)
     return dataclasses.replace(calmer, fried_m=air.fried_m * missing ** (6 / 5))  # rms ~ r0^(-5/6)
-
-
-def mean_rms_m(air: Turbulence, diameter_m: float) -> float:
-    r"""Mean rms of turbulence over a disc, tilt included, piston not.
-
-    :math:`\sigma^2 = \int W(f)\,(1 - (2 J_1(\pi D f) / (\pi D f))^2)\, 2 \pi f\, df` (Noll 1976, sec. 3).
-
-    Examples:
-        >>> air = Turbulence.from_rms(opd_rms_m=609e-9, diameter_m=8.0)
-        >>> bool(abs(mean_rms_m(air, 8.0) / 609e-9 - 1) < 0.005)  # Noll's constants have three digits
-        True
-    """
-    frequency = np.geomspace(1e-15, 1e4, 20000) / diameter_m  # a tilt is carried by very long waves
-    angle = np.pi * diameter_m * frequency
-    piston = (2 * scipy.special.j1(angle) / angle) ** 2
-    # 1 - piston is (angle / 2)^2 for long waves, where the difference has lost its digits.
-    kept = np.where(angle < 1e-3, (angle / 2) ** 2, 1 - piston)
-    density = air.opd_spectrum(frequency) * kept * 2 * np.pi * frequency
-    return math.sqrt(float(scipy.integrate.trapezoid(density * frequency, np.log(frequency))))
 
 
 def seeing_arcsec(air: Turbulence) -> float:
