@@ -173,7 +173,9 @@ class FrozenFlow(eqx.Module):
         """
         if not layers:
             raise SettingsError("layers", "must be at least one", "none")
-        longest_s = unrepeated_s(screens, layers)
+        shape = screens.low_waves_y.shape[1], screens.low_waves_x.shape[1]
+        period = screens.amplitude_m.shape[0]
+        longest_s = unrepeated_s(layers, shape=shape, pixel_m=screens.pixel_m, period=period)
         if not duration_s <= longest_s:
             rule = f"must be at most {longest_s:.4g} s, after which this air repeats itself"
             raise SettingsError("duration_s", rule, f"{duration_s:g} s")
@@ -191,26 +193,30 @@ class FrozenFlow(eqx.Module):
             return sum((layer.opd_m(time_s) for layer in self.layers[1:]), self.layers[0].opd_m(time_s))
 
 
-def unrepeated_s(screens: PhaseScreens, layers: Sequence[WindLayer]) -> float:
+def unrepeated_s(layers: Sequence[WindLayer], *, shape: tuple[int, int], pixel_m: float, period: int) -> float:
     """How long no layer shows a piece of fine structure twice; infinite for a calm.
 
     The air is a pattern with a period along x and along y. It shows again when the window, with what the
     interpolation needs around it, has moved by whole periods to within its own width. A wind across the axes drifts
     past its own track and stays new for longer.
 
+    Args:
+        layers: How each layer moves.
+        shape: Pixels of the window along y and x.
+        pixel_m: Width of a pixel.
+        period: Pixels after which the fine structure repeats.
+
     Examples:
-        >>> from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
-        >>> screens = PhaseScreens.build(Turbulence(0.2), shape=(32, 32), pixel_m=0.25, period=384)
+        >>> grid = {"shape": (32, 32), "pixel_m": 0.25, "period": 384}
         >>> along, across = WindLayer(direction_deg=90.0), WindLayer(direction_deg=75.0)
-        >>> round(unrepeated_s(screens, [along]), 2), round(unrepeated_s(screens, [across]), 2)
+        >>> round(unrepeated_s([along], **grid), 2), round(unrepeated_s([across], **grid), 2)
         (8.03, 31.01)
     """
-    period = screens.amplitude_m.shape[0]
-    window = [waves.shape[1] + TAPS - 1 for waves in (screens.low_waves_y, screens.low_waves_x)]
+    window = [count + TAPS - 1 for count in shape]
     moments = [math.inf]
     for layer in layers:
         (begin_y, end_y), (begin_x, end_x) = (
-            _near_whole_periods(speed_m_per_s / screens.pixel_m, period, width)
+            _near_whole_periods(speed_m_per_s / pixel_m, period, width)
             for speed_m_per_s, width in zip(layer.velocity_m_per_s, window, strict=True)
         )
         begin = np.maximum(begin_y[:, None], begin_x[None, :])

@@ -54,12 +54,12 @@ class SequenceSimulator(eqx.Module):
     seed: int = eqx.field(static=True)
 
     @classmethod
-    def build(cls, config: Config, shape: PupilShape | None = None) -> "SequenceSimulator":
+    def build(cls, config: Config, pupil: PupilShape | None = None) -> "SequenceSimulator":
         """Prepare the sensor and draw the air.
 
         Args:
             config: The settings.
-            shape: The pupil, as for `ExposureSimulator.build`.
+            pupil: Its shape, as for `ExposureSimulator.build`.
 
         Raises:
             SettingsError: If there is no rate, if the air would repeat before the last frame, or if settings contradict
@@ -69,10 +69,12 @@ class SequenceSimulator(eqx.Module):
         rate_hz = config.simulation.rate_hz
         if rate_hz is None:
             raise SettingsError("simulation.rate_hz", "must be given for a sequence (--rate HZ)", "nothing")
-        still = ExposureSimulator.build(config, shape)
-        screens, layers = _wide_screens(config, still), wind_layers(config)
-        _check_duration(config, unrepeated_s(screens, layers), rate_hz)
-        key = jax.random.fold_in(jax.random.key(config.seed), AIR)
+        still = ExposureSimulator.build(config, pupil)
+        shape, pixel_m = (still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]), still.light.pixel_m
+        period, layers = _period(config, max(shape), pixel_m), wind_layers(config)
+        _check_duration(config, unrepeated_s(layers, shape=shape, pixel_m=pixel_m, period=period), rate_hz)
+        dtype, key = str(still.weights.dtype), jax.random.fold_in(jax.random.key(config.seed), AIR)
+        screens = PhaseScreens.build(still.air, shape=shape, pixel_m=pixel_m, period=period, dtype=dtype)
         return cls(
             still=still,
             flow=FrozenFlow.build(screens, layers, key, duration_s=config.simulation.frames / rate_hz),
@@ -125,18 +127,15 @@ def wind_layers(config: Config) -> list[WindLayer]:
     return [WindLayer(*layer) for layer in chosen]
 
 
-def _wide_screens(config: Config, still: ExposureSimulator) -> PhaseScreens:
-    """The turbulence of a simulator, with fine structure as wide as the wind needs it."""
-    pixel_m, chosen_m = still.light.pixel_m, config.atmosphere.screen_width_m
-    lit = still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]
+def _period(config: Config, window: int, pixel_m: float) -> int:
+    """Cells along a side of the air, a number that suits the FFT."""
+    chosen_m = config.atmosphere.screen_width_m
     width_m = SCREEN_DIAMETERS * config.beam.diameter_m if chosen_m is None else chosen_m
-    narrowest, cells = max(lit) + TAPS, width_m / pixel_m
+    narrowest, cells = window + TAPS, width_m / pixel_m
     if not narrowest <= cells <= WIDEST_SCREEN:
         rule = f"must be from {narrowest * pixel_m:.4g} to {WIDEST_SCREEN * pixel_m:.4g} m on cells of {pixel_m:.3g} m"
         raise SettingsError("atmosphere.screen_width_m", rule, f"{width_m:g}{' by default' * (chosen_m is None)}")
-    period = scipy.fft.next_fast_len(math.ceil(cells))
-    dtype = str(still.weights.dtype)
-    return PhaseScreens.build(still.air, shape=lit, pixel_m=pixel_m, period=period, dtype=dtype)
+    return int(scipy.fft.next_fast_len(math.ceil(cells)) or 0)
 
 
 def _check_duration(config: Config, longest_s: float, rate_hz: float) -> None:
