@@ -114,8 +114,8 @@ def test_the_air_between_pixels_is_its_fourier_series():
     turn = np.exp(-2j * np.pi * np.add.outer(frequency * VELOCITY[0], frequency * VELOCITY[1]) * time_s / PIXEL_M)
     series = np.fft.ifft2(np.fft.fft2(np.asarray(layer.fine_m)) * turn).real[: SHAPE[0], : SHAPE[1]]
     moved = np.asarray(lonely(flow, layer.fine_m).opd_m(time_s))
-    # 2.1e-5 of the finest waves, which hold the least, and 3e-6 of the longest.
-    np.testing.assert_allclose(moved, series, atol=1e-5 * np.asarray(layer.fine_m).std())
+    # 5e-6 of waves up to half the finest, which hold nearly all; values reach four times their rms.
+    np.testing.assert_allclose(moved, series, atol=3e-5 * np.asarray(layer.fine_m).std())
     finest = np.abs(np.fft.fft2(np.asarray(layer.fine_m)))[np.abs(frequency) > FINEST / 2]
     assert finest.max() < 1e-9 * np.abs(np.fft.fft2(np.asarray(layer.fine_m))).max()  # nothing it could not move
 

@@ -131,11 +131,13 @@ def _period(config: Config, window: int, pixel_m: float) -> int:
     """Cells along a side of the air, a number that suits the FFT."""
     chosen_m = config.atmosphere.screen_width_m
     width_m = SCREEN_DIAMETERS * config.beam.diameter_m if chosen_m is None else chosen_m
-    narrowest, cells = window + TAPS, width_m / pixel_m
-    if not narrowest <= cells <= WIDEST_SCREEN:
+    narrowest, count = window + TAPS, math.ceil(width_m / pixel_m)
+    if not narrowest <= count <= WIDEST_SCREEN:
         rule = f"must be from {narrowest * pixel_m:.4g} to {WIDEST_SCREEN * pixel_m:.4g} m on cells of {pixel_m:.3g} m"
         raise SettingsError("atmosphere.screen_width_m", rule, f"{width_m:g}{' by default' * (chosen_m is None)}")
-    return int(scipy.fft.next_fast_len(math.ceil(cells)) or 0)
+    while count != scipy.fft.next_fast_len(count):
+        count += 1
+    return count
 
 
 def _check_duration(config: Config, longest_s: float, rate_hz: float) -> None:
