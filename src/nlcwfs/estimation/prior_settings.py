@@ -1,0 +1,51 @@
+"""What a user may tell about the phase before a photon is seen: the air, and the loop that flattens it."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class PriorSettings(BaseModel):
+    """The turbulence that is expected, or what a closed loop leaves of it.
+
+    Examples:
+        >>> PriorSettings(outer_scale_m=25.0).cutoff_cpa is None  # no loop: the whole turbulence
+        True
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    fried_m: float | None = Field(
+        default=None,
+        gt=0,
+        examples=[0.17],
+        description="Fried's parameter r0 at 0.5 um; when given it rules instead of the seeing",
+    )
+    outer_scale_m: float | None = Field(
+        default=None,
+        gt=0,
+        examples=[25.0],
+        description="von Karman's outer scale, at least the telescope's diameter; leave out for Kolmogorov (infinite)",
+    )
+    cutoff_cpa: float | None = Field(
+        default=None,
+        gt=0,
+        examples=[16.0],
+        description="finest wave that the mirror takes out, cycles per aperture; leave out where no loop is closed",
+    )
+    lag_s: float = Field(
+        default=0.0, ge=0, description="from the middle of an exposure to the middle of its correction on the mirror"
+    )
+    wind_speed_m_per_s: float = Field(default=10.0, ge=0, description="speed of the wind, of unknown direction")
+    photons: float | None = Field(
+        default=None,
+        gt=0,
+        examples=[1e4],
+        description="photons of the exposures that move the mirror; leave out for commands without noise",
+    )
+    sensor_loss: float = Field(
+        default=3.0,
+        ge=1,
+        description="photons that the sensor of the loop needs relative to the quantum limit, see study 01",
+    )
+    beyond_share: float = Field(
+        default=1.0, gt=0, le=1, description="share of the turbulence that is expected beyond the mirror's cutoff"
+    )
