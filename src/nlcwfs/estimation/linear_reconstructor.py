@@ -60,12 +60,12 @@ class LinearReconstructor(eqx.Module):
 
     Examples:
         >>> from nlcwfs.beam.pupil_shape import PupilShape
-        >>> geometry = SensorGeometry(PupilShape(8.0), Grid((24, 24), 0.5), 0.65e-6, (-3.5e6, 3.5e6))
-        >>> few = LinearSettings(modes=10, training_screens=60)
+        >>> geometry = SensorGeometry(PupilShape(8.0), Grid((16, 16), 0.7), 0.65e-6, (-3.5e6, 3.5e6))
+        >>> few = LinearSettings(modes=10, training_screens=40)
         >>> solver = LinearReconstructor.build(geometry, EstimationSettings(), linear=few)
-        >>> estimate = solver.estimate(jnp.ones((2, 24, 24)), jnp.ones((2, 24, 24), bool))
+        >>> estimate = solver.estimate(jnp.ones((2, 16, 16)), jnp.ones((2, 16, 16), bool))
         >>> estimate.opd_m.shape, int(estimate.iterations)
-        ((24, 24), 0)
+        ((16, 16), 0)
     """
 
     features: BinnedFeatures
@@ -104,7 +104,9 @@ class LinearReconstructor(eqx.Module):
         linear = LinearSettings() if linear is None else linear
         bin_pixels = linear.bin_pixels or bin_size(geometry)
         if bin_pixels > min(geometry.frame.shape):
-            raise SettingsError("linear.bin_pixels", f"must fit on frames of {geometry.frame.shape} pixels", bin_pixels)
+            raise SettingsError(
+                "estimation.linear.bin_pixels", f"must fit on frames of {geometry.frame.shape}", bin_pixels
+            )
         air, strongest = strongest_air(geometry, settings)
         told = settings.seeing_arcsec is not None
         alone = {"coarse_cutoffs_cpa": (), "binning": 1, "gain": linear.gain}
