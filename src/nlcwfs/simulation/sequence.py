@@ -90,9 +90,8 @@ class SequenceSimulator(eqx.Module):
 
     def moments_s(self, frame: int | Float[Array, ""]) -> Float[Array, " substep"]:
         """When the light of an exposure is computed; frame 0 begins at 0."""
-        return (
-            frame + (jnp.arange(self.substeps, dtype=self.still.weights.dtype) + 0.5) / self.substeps
-        ) / self.rate_hz
+        middle = (jnp.arange(self.substeps, dtype=self.still.weights.dtype) + 0.5) / self.substeps
+        return (frame + middle) / self.rate_hz
 
     def expose(self, frame: int) -> Exposure:
         """One exposure of the sequence, counted from 0."""
