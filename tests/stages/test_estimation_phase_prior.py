@@ -255,6 +255,19 @@ def test_between_pixels_waves_are_moved_as_waves():
     np.testing.assert_allclose(found, wave(0.037), atol=1e-12)
 
 
+def test_the_finest_wave_keeps_what_the_grid_can_show_of_it():
+    """Half a cycle per pixel along y, moved by a part of a pixel: a cosine; along x another wave is moved as ever."""
+    grid, (down_m, left_m) = Grid((6, 9), 0.5), (0.11, 0.17)
+    turn = 2 * np.pi * 2 / 4.5 * (np.arange(9)[None, :] * 0.5 + left_m)
+    finest = (-1.0) ** np.arange(6)[:, None]
+    found, _ = prediction.predicted_mean_and_power(
+        jnp.asarray(finest * np.cos(turn - 2 * np.pi * 2 / 4.5 * left_m)),
+        *[jnp.ones((6, 5))] * 2,
+        carriage(grid, [(1.0, down_m, -left_m)], 1.0),
+    )
+    np.testing.assert_allclose(found, math.cos(math.pi * down_m / 0.5) * finest * np.cos(turn), atol=1e-12)
+
+
 def frozen_flow(rng, velocities: np.ndarray, shares: np.ndarray, interval_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Two moments of layers that move on the periodic grid, NumPy phase ramps: `velocities[draw layer axis]`."""
     amplitude = np.sqrt(whole(GRID, AIR))
