@@ -69,6 +69,7 @@ def linear_world(screens: int):
 
 def test_the_matrix_is_the_linear_estimate_of_least_error():
     response, variance, noise, training = linear_world(100_000)
+    rng = np.random.default_rng(3)
     found = learn(training, noise, judges=2000, beyond_m2=0.3, dtype="float64")
     for which in (0, 2, 4):
         seen = response.T * variance @ response + noise / PHOTONS[which]
@@ -80,11 +81,14 @@ def test_the_matrix_is_the_linear_estimate_of_least_error():
         assert error <= got < 1.05 * error  # the ridge comes from a list, in steps of 1.8
         np.testing.assert_allclose(found.noise_m2[which], np.trace(matrix @ noise @ matrix.T), rtol=0.01)
         # The error that it promises: bias over the judges' wavefronts, noise, and what lies beyond the modes.
-        features = Features(jnp.asarray(training.values[0]), jnp.ones(5, bool))
-        judged = found.judge(features, jnp.asarray(PHOTONS[which]))
         missed = np.mean(np.asarray(found.missed_m2[which]))
         assert missed == pytest.approx(0.3 + np.sum(bias**2 * variance), rel=5 * np.sqrt(2 / 2000) + 0.05)
-        assert judged.variance_m2 > 0.3
+        noisy = training.values[:2000] + rng.multivariate_normal(np.zeros(5), noise / PHOTONS[which], 2000)
+        photons, known = jnp.asarray(PHOTONS[which]), jnp.ones(5, bool)
+        judged = jax.vmap(lambda values: found.judge(Features(values, known), photons))(jnp.asarray(noisy))  # noqa: B023
+        left = np.sum((np.asarray(judged.coefficients_m) - training.coefficients_m[:2000]) ** 2, axis=1).mean()
+        assert left == pytest.approx(got, rel=0.15)  # 5 sigma of 2000 squares of three modes
+        assert np.mean(judged.variance_m2) == pytest.approx(got + 0.3, rel=0.15)
 
 
 def test_an_unknown_bin_says_nothing():
