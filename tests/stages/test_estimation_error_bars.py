@@ -80,7 +80,9 @@ def beyond(case: str) -> float:
     return (basis.kolmogorov_total_rad2 - np.sum(basis.kolmogorov_rad2)) * whole(case)[3]
 
 
-BANDS_CPA = {"slowest": (0, 2), "low": (0, 4), "2 to 4": (2, 4), "middle": (4, 12), "high": (12, 99)}
+# Band and tolerance. Random signs scatter the errors of narrow bands by 1 to 2 %; the series leaves out 1 %.
+# The slowest modes know no signs but those of their coupling to others: 0.3 %.
+BANDS_CPA = {"slowest": (0, 2, 0.008), "2 to 4": (2, 4, 0.05), "middle": (4, 12, 0.02), "high": (12, 99, 0.02)}
 
 
 @pytest.mark.parametrize("options", [{}, {"slow_below_cpa": 2.3, "probes": 3}], ids=["default", "other"])
@@ -88,11 +90,10 @@ BANDS_CPA = {"slowest": (0, 2), "low": (0, 4), "2 to 4": (2, 4), "middle": (4, 1
 def test_the_errors_in_bands_are_those_of_the_whole_matrix(case, options):
     cycles, exact = np.asarray(telescope()[0].cycles_per_aperture), np.diag(posterior(case))
     mode_rad2 = np.asarray(found(case, **options).mode_rad2)
-    for low, high in BANDS_CPA.values():
+    for low, high, tolerance in BANDS_CPA.values():
         here = (cycles >= low) & (cycles < high)
         assert here.sum() >= 10
-        # Random signs scatter the errors of narrow bands by 1.5 %; what is left of the series is 2 %.
-        assert math.sqrt(mode_rad2[here].sum() / exact[here].sum()) == pytest.approx(1, abs=0.05)
+        assert math.sqrt(mode_rad2[here].sum() / exact[here].sum()) == pytest.approx(1, abs=tolerance)
     total = math.sqrt(exact.sum() + beyond(case))
     assert found(case, **options).wavefront_rad == pytest.approx(total, rel=0.01)
 
@@ -204,6 +205,20 @@ def test_planes_that_are_unused_or_dark_tell_nothing(strength):
     expected = 1 / (information + 1 / (strength * np.asarray(modes.turbulent_rad2)))
     np.testing.assert_allclose(bars.mode_rad2, expected, rtol=1e-9)
     np.testing.assert_allclose(bars.sensor_loss, 4 * 10 / information, rtol=1e-9)
+
+
+def test_one_number_makes_nothing_less_known_than_it_was():
+    """All modes look alike, which the series of nearly independent modes cannot follow: then the turbulence bounds."""
+    pupil, modes = small_telescope()
+    pattern = jnp.asarray(np.random.default_rng(2).normal(size=pupil.shape) * pupil)
+    prior = 100 * np.asarray(modes.turbulent_rad2)
+    told = {"strength": 100.0, "photons": 10.0, "key": jax.random.key(4)}
+    for noise in (1e-6, 1e-2, 1e2):
+        bars = error_bars(
+            lambda phase_rad: jnp.sum(pattern * phase_rad).reshape(1, 1, 1), jnp.full((1, 1, 1), noise), modes, **told
+        )
+        assert np.all(bars.mode_rad2 <= prior * (1 + 1e-12))
+        assert np.all(bars.mode_rad2 > 0)
 
 
 def test_without_light_the_turbulence_is_what_is_left():

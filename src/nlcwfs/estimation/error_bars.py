@@ -249,9 +249,7 @@ def _covariance(
 
     Three terms of the series of the Schur complement's inverse: unlike the inverse itself they cannot turn negative.
     """
-    scale = jax.lax.rsqrt(jnp.diag(own))
-    alone = jnp.linalg.inv(own * scale[:, None] * scale[None])
-    alone = (alone + alone.T) / 2 * scale[:, None] * scale[None]
+    alone = jnp.linalg.inv((own + own.T) / 2)
     taken = (coupling / known[None]) @ coupling.T
     once = taken @ alone
     return alone + alone @ once + alone @ once @ once
