@@ -359,6 +359,67 @@ def test_the_filter_knows_its_error_while_it_follows_a_phase():
     assert in_rings(np.asarray(left))[0] < 0.1 * noise / in_rings(np.asarray(power))[0]
 
 
+def errors_over_told(correlation: np.ndarray, *, noise: float, interval_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Three frozen layers followed by a settled filter, wave by wave in NumPy: errors over those told and over none."""
+    rng, power = np.random.default_rng(11), whole(GRID, AIR)
+    fy = np.fft.fftfreq(GRID.shape[0], GRID.pixel_m)[:, None]
+    fx = np.fft.rfftfreq(GRID.shape[1], GRID.pixel_m)
+    settled = prediction.settled_power(jnp.asarray(power), jnp.asarray(correlation), 1 / noise)
+    left = np.asarray(prediction.posterior_power(settled, 1 / noise))
+    size, errors = math.sqrt(np.prod(GRID.shape)), np.zeros(power.shape)
+    for _ in range(4):
+        angle = rng.uniform(0, 2 * np.pi, 3)
+        air = [np.fft.rfft2(rng.normal(size=GRID.shape)) * np.sqrt(power * share) for share in (0.5, 0.3, 0.2)]
+        turn = [
+            np.exp(-2j * np.pi * interval_s * speed * (fy * np.sin(each) + fx * np.cos(each)))
+            for speed, each in zip((7.0, 10.0, 15.0), angle, strict=True)
+        ]
+        estimate = np.zeros(power.shape)
+        for frame in range(160):
+            air = [layer * one for layer, one in zip(air, turn, strict=True)]
+            seen = sum(air) + np.fft.rfft2(rng.normal(size=GRID.shape)) * math.sqrt(noise)
+            before = correlation * estimate
+            estimate = before + left / noise * (seen - before)
+            if frame >= 80:
+                errors += abs(estimate - sum(air)) ** 2 / size**2 / 320
+    without = in_rings(power / (1 + power / noise))
+    return np.sqrt(in_rings(errors) / in_rings(left)), np.sqrt(in_rings(errors) / without)
+
+
+def test_a_stream_is_followed_by_a_filter_that_knows_how_long_the_wind_lets_it_remember():
+    noise, wind = 0.2, {"wind_m_per_s": 10.0, "interval_s": 1e-3}
+    once = prediction.wind_correlation(GRID, **wind)
+    lasting = prediction.lasting_correlation(GRID, whole(GRID, AIR), information=1 / noise, **wind)
+    assert np.all((lasting <= once + 1e-12) & (lasting > 0))
+    told, gained = errors_over_told(lasting, noise=noise, interval_s=1e-3)
+    np.testing.assert_allclose(told, 0.95, atol=0.1)  # rings of few waves scatter by 5 %
+    naive_told, naive_gained = errors_over_told(once, noise=noise, interval_s=1e-3)
+    assert np.all(naive_told[1:] > 1.4)  # a filter that takes each frame's news for unrelated to the last one's
+    assert np.all(gained[1:] < 0.8 * naive_gained[1:])
+
+
+def test_the_lasting_correlation_is_that_over_the_memory_of_its_own_filter():
+    noise, power = 0.2, whole(GRID, AIR)
+    lasting = prediction.lasting_correlation(GRID, power, information=1 / noise, wind_m_per_s=10.0, interval_s=1e-3)
+    settled = power.copy()
+    for _ in range(5000):  # Riccati's equation of NumPy
+        settled = lasting**2 / (1 / settled + 1 / noise) + (1 - lasting**2) * power
+    remembered = 2 * (settled + noise) / settled
+    angle = 2 * np.pi * frequencies(GRID)[:, : power.shape[1]] * 10.0 * 1e-3
+    expected = j0(angle * remembered) ** (1 / remembered)
+    seen = (angle > 0) & (angle * remembered < 2.2)
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(1 - lasting[seen], 1 - expected[seen], rtol=1e-4)  # the iterations of both
+
+
+def test_what_turns_too_fast_is_not_remembered_and_what_stands_still_is_kept():
+    power = whole(GRID, AIR)
+    gale = prediction.lasting_correlation(GRID, power, information=5.0, wind_m_per_s=400.0, interval_s=0.01)
+    assert np.all(gale[frequencies(GRID)[:, : power.shape[1]] > 0.2] < 0.5)
+    calm = prediction.lasting_correlation(GRID, power, information=5.0, wind_m_per_s=0.0, interval_s=0.01)
+    np.testing.assert_array_equal(calm, 1)
+
+
 @pytest.mark.parametrize("moved", [0.0, 0.05, 0.4, 0.99, 1.5])
 def test_unseen_air_is_the_part_of_a_disc_outside_of_its_shifted_self(moved):
     axis = (np.arange(1000) - 499.5) / 1000

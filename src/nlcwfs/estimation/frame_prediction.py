@@ -2,8 +2,9 @@
 
 This is Kalman's filter (1960, J. Basic Eng. 82, 35), diagonal in Fourier space: each wave is followed on its own, so
 that the prediction of a frame costs two FFTs and no matrix. It is exact where the phase is seen on the whole periodic
-grid and is as new from frame to frame as the correlation says. The rim of a pupil couples waves, and air that comes
-in over it has not been seen: `unseen_share` puts that right on average. Powers are those of `phase_prior`.
+grid and forgets as the correlation says. For a stream that is `lasting_correlation`. The rim of a pupil couples waves,
+and air that comes in over it has not been seen: `unseen_share` puts that right on average. Powers are those of
+`phase_prior`.
 """
 
 import math
@@ -16,6 +17,11 @@ from jaxtyping import Array, Complex, Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.turbulence_filter import half_plane_frequencies
+
+REMEMBERED = 2.0
+"""Frames over which a filter needs the wave to stay itself, over the inverse of its gain. Measured: with 2 the error is
+within 2 % of the best that a filter of this kind can do, and told within 9 %; with 1 it is 8 % larger and told 15 %
+too small (260 to 2000 Hz, 300 to 11500 photons a frame, three layers)."""
 
 
 def posterior_power(
@@ -46,13 +52,62 @@ def wind_correlation(grid: Grid, *, wind_m_per_s: float, interval_s: float) -> F
     return np.maximum(scipy.special.j0(angle), 0)
 
 
+def lasting_correlation(
+    grid: Grid,
+    power: Float[np.ndarray, "y fx"],
+    *,
+    information: float | Float[np.ndarray, "y fx"],
+    wind_m_per_s: float,
+    interval_s: float,
+) -> Float[np.ndarray, "y fx"]:
+    r"""How much of each wave is seen again, per frame over the frames that the filter remembers: what a stream needs.
+
+    Frozen flow does not forget the same share each frame: a wave keeps turning the same way, and what is new after ten
+    frames is a hundred times what is new after one. `wind_correlation` is right from one frame to the next, but a
+    filter that believes it for good remembers too long: at 1 kHz and 3000 photons its errors are 1.1 to 2.3 times what
+    it says, and twice what they need be. So this takes :math:`J_0(2 \pi f v n t)^{1/n}`, with n the frames that the
+    settled filter remembers; found by iteration.
+
+    Args:
+        grid: Pixels of the phase.
+        power: Of the whole turbulence.
+        information: Of a frame, per pixel, see `posterior_power`.
+        wind_m_per_s: Speed of the wind, direction unknown.
+        interval_s: Time to the next frame.
+
+    Examples:
+        >>> from nlcwfs.atmosphere.phase_screen import Turbulence
+        >>> from nlcwfs.estimation.turbulence_filter import expected_power
+        >>> grid, air = Grid((16, 16), 0.5), Turbulence.from_seeing(seeing_arcsec=0.6)
+        >>> power = expected_power(grid, air, wavelength_m=0.85e-6, cutoff_per_m=None)
+        >>> wind = {"wind_m_per_s": 10.0, "interval_s": 0.001}
+        >>> once = wind_correlation(grid, **wind)[0, 4]
+        >>> lasting = lasting_correlation(grid, power, information=10.0, **wind)[0, 4]
+        >>> round(float(1 - once), 5), round(float(1 - lasting), 5)
+        (0.00025, 0.00135)
+    """
+    angle = 2 * np.pi * half_plane_frequencies(grid) * wind_m_per_s * interval_s
+    frames, again = np.ones_like(angle), np.ones_like(angle)
+    for _ in range(80):
+        # Beyond 2.2 rad, before the first zero of J0, the wave is lost to the filter all the same.
+        lasting = scipy.special.j0(np.minimum(angle * frames, 2.2)) ** (1 / frames)
+        again = np.minimum(lasting, np.maximum(scipy.special.j0(angle), 0))
+        new = (1 - again**2) * power
+        half = (1 - again**2 - new * information) / 2
+        signal = np.sqrt(half**2 + new * information) - half  # settled power times information
+        gain = np.maximum(signal / (1 + signal), 1e-5)
+        frames = np.sqrt(frames * np.maximum(REMEMBERED / gain, 1))
+    return again
+
+
 def wind_carriage(
     grid: Grid, layers: Sequence[tuple[float, float, float]], *, interval_s: float
 ) -> Complex[np.ndarray, "y fx"]:
     r"""What the next frame shows of each wave, for layers of known wind: :math:`\sum w \exp(-2 \pi i f \cdot v t)`.
 
     One layer moves as a whole, with factors of modulus 1; several smear each other's fine waves. The wave of half a
-    cycle per pixel has no sign on the grid and keeps a cosine.
+    cycle per pixel has no sign on the grid and keeps a cosine. What layers smear is right from one frame to the next; a
+    stream follows several layers no better than by `lasting_correlation`, for the reason given there.
 
     Args:
         grid: Pixels of the phase, periodic.
