@@ -1,5 +1,6 @@
 """Angles and back, fast: what a phase costs besides its FFTs."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -32,6 +33,28 @@ def cosine_and_sine(
     square = folded * folded
     cosine, sine = _polynomial(COSINE, square), folded * _polynomial(SINE, square)
     return jnp.where(behind, -cosine, cosine), sine
+
+
+@jax.custom_jvp
+def phasor(phase_rad: Float[Array, "*shape"]) -> Complex[Array, "*shape"]:
+    """`exp(i phase)`, fast; its derivative is exactly `i exp(i phase)`.
+
+    Examples:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> value, change = jax.jvp(phasor, (jnp.asarray(0.0),), (jnp.asarray(2.0),))
+        >>> complex(value), abs(complex(change) - 2j)
+        ((1+0j), 0.0)
+    """
+    cosine, sine = cosine_and_sine(phase_rad)
+    return jax.lax.complex(cosine, sine)
+
+
+@phasor.defjvp
+def _phasor_jvp(primals: tuple, tangents: tuple) -> tuple:
+    (phase_rad,), (change,) = primals, tangents
+    value = phasor(phase_rad)
+    return value, jax.lax.complex(-value.imag * change, value.real * change)
 
 
 def angle(numbers: Complex[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.amplitude_constraint import doubt_factor, mean_count, modulus_factor
-from nlcwfs.estimation.angle import angle, cosine_and_sine, wrap
+from nlcwfs.estimation.angle import angle, phasor, wrap
 from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import SPEED, blurred
@@ -115,8 +114,8 @@ def terminate(problem: Problem, state: GerchbergSaxtonState) -> Array:
 
 def pupil_light(level: Level, phase_rad: Float[Array, "y x"]) -> Complex[Array, "y x"]:
     """Light of unit power at the pupil with this phase."""
-    cosine, sine = cosine_and_sine(phase_rad)
-    return jax.lax.complex(level.modulus * cosine, level.modulus * sine)
+    light = phasor(phase_rad)
+    return level.modulus.astype(light.dtype) * light
 
 
 def plane_groups(

@@ -10,9 +10,9 @@ from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.errors import SettingsError
+from nlcwfs.estimation.gerchberg_saxton_settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.resolution_level import Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
-from nlcwfs.estimation.settings import GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import image_structures, smoothing_factor, unmodelled_variance
 from nlcwfs.estimation.turbulence_filter import expected_power
 
@@ -58,6 +58,15 @@ def build_ladder(
     levels = [level(binning, binned)] if binned else []
     levels += [level(1, unbinned)] if unbinned else []
     return (*levels, level(1, ()))
+
+
+def finest_level(
+    geometry: SensorGeometry, turbulence: Turbulence, *, oversampling: int, window: float, dtype: str
+) -> Level:
+    """The full resolution alone, in a window of at least so many telescopes."""
+    shape = window_shape(geometry, 1, window)
+    settings = GerchbergSaxtonSettings(oversampling=oversampling)
+    return _level(geometry, settings, turbulence, Grid(shape, geometry.frame.pixel_m), 1, (), dtype=dtype)
 
 
 def _check_cutoffs(cutoffs_cpa: tuple[float, ...]) -> None:
@@ -126,8 +135,8 @@ def _level(
     )
 
 
-def window_shape(geometry: SensorGeometry, binning: int) -> tuple[int, int]:
-    """Pixels of the model's window: it holds the frames and the spread light, and suits FFT and binning.
+def window_shape(geometry: SensorGeometry, binning: int, window: float = ROOM) -> tuple[int, int]:
+    """Pixels of the model's window: it holds the frames and `window` telescopes, and suits FFT and binning.
 
     Examples:
         >>> from nlcwfs.beam.pupil_shape import PupilShape
@@ -135,7 +144,7 @@ def window_shape(geometry: SensorGeometry, binning: int) -> tuple[int, int]:
         >>> window_shape(geometry, 1)
         (64, 63)
     """
-    needed = ROOM * geometry.pupil.diameter_m / geometry.frame.pixel_m
+    needed = window * geometry.pupil.diameter_m / geometry.frame.pixel_m
 
     def size(frame: int) -> int:
         count = max(frame, int(np.floor(needed)))

@@ -34,7 +34,14 @@ class PriorSettings(BaseModel):
     lag_s: float = Field(
         default=0.0, ge=0, description="from the middle of an exposure to the middle of its correction on the mirror"
     )
-    wind_speed_m_per_s: float = Field(default=10.0, ge=0, description="speed of the wind, of unknown direction")
+    wind_speed_m_per_s: float = Field(default=10.0, ge=0, description="speed of the wind")
+    wind_direction_deg: float | None = Field(
+        default=None,
+        ge=-360,
+        le=360,
+        examples=[0.0],
+        description="where the air goes, from +x towards +y, for sequences; leave out when not known",
+    )
     photons: float | None = Field(
         default=None,
         gt=0,

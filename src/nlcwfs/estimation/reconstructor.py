@@ -14,7 +14,7 @@ from nlcwfs.estimation.centroid_tilt import centroid_tilt
 from nlcwfs.estimation.fit_quality import BELIEVED, speckle_band, unexplained_share, verdict
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.ladder import build_ladder
-from nlcwfs.estimation.resolution_level import Level, Measurement, resample_phase, sum_blocks
+from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, resample_phase, sum_blocks
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import unmodelled_variance
@@ -130,9 +130,23 @@ class GerchbergSaxton(eqx.Module):
         Returns:
             The estimate on the frames' pixels.
         """
+        measured = self.measurement(counts, usable, read_variance)
+        slope, climb = self.search(measured, start_m)
+        return self._account(measured, slope, climb)
+
+    def measurement(
+        self, counts: Float[Array, "plane y x"], usable: Bool[Array, "plane y x"], read_variance: float | Array
+    ) -> Measurement:
+        """The counts in the window of the model."""
         dtype = self.first_strength.dtype
         measured = Measurement(counts.astype(dtype), usable, jnp.asarray(read_variance, dtype))
-        measured = measured.padded(self.levels[-1].measured_shape)
+        return measured.padded(self.levels[-1].measured_shape)
+
+    def search(
+        self, measured: Measurement, start_m: Float[Array, "y x"] | None = None
+    ) -> tuple[Float[Array, "2"], "Climb"]:
+        """Coarse to fine: the tilt (y, x; m/m) and, on the grid of the last level, the phase beside it."""
+        dtype = self.first_strength.dtype
         start_m = None if start_m is None else start_m.astype(dtype)
         slope = self._starting_slope(measured, start_m)
         climb = Climb(
@@ -144,7 +158,7 @@ class GerchbergSaxton(eqx.Module):
         )
         for level in self.levels:
             climb = self._climb(level, measured.binned(level.binning), slope, climb)
-        return self._account(measured, slope, climb)
+        return slope, climb
 
     def _climb(self, level: Level, measured: Measurement, slope: Float[Array, "2"], climb: "Climb") -> "Climb":
         """All the cutoffs of one level."""
@@ -245,7 +259,7 @@ class GerchbergSaxton(eqx.Module):
             predicted_error_m=jnp.sqrt(seen_rad**2 + climb.strength * self.beyond_pixels)
             * (wavelength_m / (2 * np.pi)),
             unexplained=unexplained,
-            residual=jnp.stack([_cropped(plane, self.geometry.frame.shape) for plane in residual]),
+            residual=jnp.stack([cropped(plane, self.geometry.frame.shape) for plane in residual]),
             iterations=climb.iterations,
             ffts=climb.ffts + 3 * measured.counts.shape[0] + 1 + slip_ffts,
             outcome_code=verdict(
@@ -261,7 +275,7 @@ class GerchbergSaxton(eqx.Module):
     def _on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """From the finest grid to the pixels of the frames: the mean over each."""
         factor = self.levels[-1].oversampling
-        return _cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)
+        return cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)
 
 
 class Climb(eqx.Module):
@@ -280,8 +294,3 @@ class Climb(eqx.Module):
     iterations: Int[Array, ""]
     ffts: Int[Array, ""]
     change_rad: Float[Array, ""]
-
-
-def _cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:
-    rows, columns = ((outer - inner) // 2 for outer, inner in zip(array.shape, shape, strict=True))
-    return array[rows : rows + shape[0], columns : columns + shape[1]]

@@ -118,6 +118,12 @@ def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "p
     return array.reshape(planes, rows // factor, factor, columns // factor, factor).sum(axis=(2, 4))
 
 
+def cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:
+    """The middle of an array."""
+    rows, columns = ((outer - inner) // 2 for outer, inner in zip(array.shape, shape, strict=True))
+    return array[rows : rows + shape[0], columns : columns + shape[1]]
+
+
 def resample_phase(phase_rad: Float[Array, "y x"], shape: tuple[int, int], *, wrapped: bool) -> Float[Array, "v u"]:
     """The same phase over the same window, on another number of pixels.
 

@@ -68,10 +68,20 @@ def expected_error(power: Float[Array, "y fx"], noise_variance: Float[Array, ""]
         noise_variance: Variance of white phase noise per pixel, rad^2.
         grid: Pixels of the phase.
     """
+    return rms_of_power(power * noise_variance / (power + noise_variance), grid)
+
+
+def rms_of_power(power: Float[Array, "y fx"], grid: Grid) -> Float[Array, ""]:
+    """Rms of a phase with this power, piston excluded.
+
+    Examples:
+        >>> round(float(rms_of_power(jnp.ones((8, 5)), Grid((8, 8), 1.0))) ** 2, 6)  # white noise less its mean
+        0.984375
+    """
     rows, columns = grid.shape
     twice = np.full(columns // 2 + 1, 2.0)
     twice[0] = 1.0
     if columns % 2 == 0:
         twice[-1] = 1.0
-    left = power * noise_variance / (power + noise_variance) * jnp.asarray(twice[None, :], power.dtype)
-    return jnp.sqrt((jnp.sum(left) - left[0, 0]) / (rows * columns))
+    counted = power * jnp.asarray(twice[None, :], power.dtype)
+    return jnp.sqrt((jnp.sum(counted) - counted[0, 0]) / (rows * columns))

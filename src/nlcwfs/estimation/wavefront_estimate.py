@@ -3,6 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float, Int
 
+from nlcwfs.estimation.error_bars import ErrorBars
 from nlcwfs.estimation.outcome import Outcome
 
 
@@ -19,6 +20,7 @@ class WavefrontEstimate(eqx.Module):
         ffts: Two-dimensional FFTs of one plane, over all resolutions.
         outcome_code: `Outcome` as a number.
         strength: Variance of the turbulence over that of 0.6" seeing, as given or as measured.
+        error_bars: Error of every mode; None where the method tells none.
     """
 
     opd_m: Float[Array, "*frame y x"]
@@ -29,6 +31,7 @@ class WavefrontEstimate(eqx.Module):
     ffts: Int[Array, "*frame"]
     outcome_code: Int[Array, "*frame"]
     strength: Float[Array, "*frame"]
+    error_bars: ErrorBars | None = None
 
     @property
     def outcome(self) -> Outcome:

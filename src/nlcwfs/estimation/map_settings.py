@@ -1,0 +1,60 @@
+"""What a user may choose about the maximum a posteriori reconstruction; defaults by measurement (study 02)."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from nlcwfs.estimation.gerchberg_saxton_settings import GerchbergSaxtonSettings
+
+
+class MapSettings(BaseModel):
+    """The maximum a posteriori (MAP) reconstructor.
+
+    Examples:
+        >>> MapSettings().oversampling
+        2
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    capture: GerchbergSaxtonSettings = Field(
+        default=GerchbergSaxtonSettings(coarse_cutoffs_cpa=(2.0, 4.0, 8.0), iterations=5),
+        description="how the first guess is found, coarse to fine",
+    )
+    oversampling: int = Field(
+        default=2, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
+    )
+    window: float = Field(
+        default=2.0, ge=1.2, le=10, description="least width of the model's window over the telescope's diameter"
+    )
+    steps: int = Field(default=3, ge=1, le=1000, description="most Gauss-Newton steps of one solution")
+    conjugate_gradients: int = Field(default=6, ge=1, le=1000, description="conjugate gradients of each step")
+    tolerance: float = Field(
+        default=0.01,
+        ge=0,
+        description="stop when a step promises less than this many nats for each mode that the light shows",
+    )
+    dark_share: float = Field(
+        default=0.03,
+        ge=0,
+        le=10,
+        description="share of the mean count that counts as noise everywhere: light of the turbulence that is finer "
+        "than the model",
+    )
+    fits_background: bool = Field(default=False, description="estimate a background for each plane")
+    flux: Literal["measured", "given"] = Field(
+        default="measured", description="share of the light of each plane: from the counts, or as the sensor is told"
+    )
+    healings: int = Field(
+        default=4, ge=0, le=100, description="most tries to bring back islands of the phase that are a turn off"
+    )
+    healing_iterations: int = Field(
+        default=8, ge=1, le=1000, description="Gerchberg-Saxton iterations on the field of each try"
+    )
+    healing_gain: float = Field(default=2.0, gt=0, le=10, description="length of their steps")
+    ffts_per_frame: int = Field(
+        default=100, ge=1, le=1000000, description="FFTs for each frame of a sequence after the first; fixed"
+    )
+    sequence_steps: int = Field(
+        default=2, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"
+    )

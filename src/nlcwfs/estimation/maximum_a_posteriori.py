@@ -1,0 +1,278 @@
+"""The maximum a posteriori wavefront: the one that photons and turbulence together make most likely."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nlcwfs.beam.grid import Grid
+from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
+from nlcwfs.estimation import gauss_newton as gn
+from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share
+from nlcwfs.estimation.gerchberg_saxton import phase_noise
+from nlcwfs.estimation.ladder import finest_level
+from nlcwfs.estimation.map_error import MapError
+from nlcwfs.estimation.map_solution import Search, Task, searched
+from nlcwfs.estimation.map_verdict import map_verdict
+from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.phase_prior import expected_air, prior_power
+from nlcwfs.estimation.reconstructor import SENSOR_LOSS, TYPICAL_SEEING_ARCSEC, Climb, GerchbergSaxton
+from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, sum_blocks
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.sensor_model import PlaneScale, light_on_pixels, mean_counts, plane_scale
+from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.speckle_blur import unmodelled_variance
+from nlcwfs.estimation.tilt import tilt_phase
+from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
+from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
+
+TILT_VARIANCE = 0.449
+"""Variance of Kolmogorov's tilt along one axis over (D / r0)^(5/3), rad^2 (Noll 1976, table 4)."""
+
+SHOWN = 0.87
+"""Share of the strength that the slopes of a first guess show: 0.78 to 0.91 for D / r0 of 8 to 25 and 2e3 to 2e6
+photons, with a scatter of 0.12 to 0.18."""
+
+START_NOISE = 0.1
+"""Share of the phase noise that is filtered from the first guess, which is smooth already."""
+
+
+class Found(NamedTuple):
+    """What one exposure led to.
+
+    Attributes:
+        task: What was to be solved.
+        search: The solutions.
+        slope: Starting tilt (y, x), metres per metre.
+        strength: Variance of the turbulence over that of the prior.
+    """
+
+    task: Task
+    search: Search
+    slope: Float[Array, "2"]
+    strength: Float[Array, ""]
+
+
+class MaximumAPosteriori(eqx.Module):
+    r"""Reconstructs wavefronts of one sensor: photons as the likelihood, turbulence as the prior.
+
+    The unwrapped phase minimises :math:`\sum \mu - n \log \mu + |x|^2 / 2` with :math:`\phi = F^{-1} \sqrt{P} F x`, by
+    Fisher scoring (`gauss_newton`) from a coarse-to-fine first guess (`capture`). Then Gerchberg-Saxton on the field
+    tears what may be wrong by whole turns (`turn_islands`), and a second solution starts from there: a wavefront is
+    believed when two ways lead to it. It has the methods of `GerchbergSaxton`.
+
+    Attributes:
+        level: The sensor on the grid of the model.
+        capture: Finds the first guess.
+        power: Expected power of each wave, for turbulence of strength 1.
+        tilt_rms_rad: Expected rms of the tilt along one axis, for strength 1.
+        beyond_cells: Variance of the phase beyond the model's cells, for strength 1, rad^2.
+        band: See `speckle_band`.
+        error: Tells the error bars.
+
+    Examples:
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> geometry = SensorGeometry(
+        ...     pupil=PupilShape(diameter_m=8.0),
+        ...     frame=Grid((32, 32), pixel_m=0.36),
+        ...     wavelength_m=0.65e-6,
+        ...     distances_m=(-3.5e6, 3.5e6),
+        ... )
+        >>> solver = MaximumAPosteriori.build(geometry, EstimationSettings(modes=100))
+        >>> estimate = solver.estimate(jnp.ones((2, 32, 32)), jnp.ones((2, 32, 32), bool))
+        >>> estimate.opd_m.shape, estimate.outcome.succeeded
+        ((32, 32), False)
+    """
+
+    level: Level
+    capture: GerchbergSaxton
+    power: Float[Array, "y fx"]
+    tilt_rms_rad: Float[Array, ""]
+    beyond_cells: Float[Array, ""]
+    band: Float[Array, "v fu"]
+    error: MapError
+    settings: EstimationSettings = eqx.field(static=True)
+    geometry: SensorGeometry = eqx.field(static=True)
+
+    @classmethod
+    def build(
+        cls, geometry: SensorGeometry, settings: EstimationSettings, *, dtype: str = "float32"
+    ) -> "MaximumAPosteriori":
+        """Precompute filters, travel and error bars.
+
+        Args:
+            geometry: The sensor.
+            settings: Options; without a seeing and Fried's parameter the strength of the turbulence is measured.
+            dtype: Precision.
+
+        Raises:
+            SettingsError: If an option contradicts another, or a prior is impossible.
+            SamplingError: If the pupil does not fit on the frames.
+        """
+        options, diameter_m, wavelength_m = settings.map, geometry.pupil.diameter_m, geometry.wavelength_m
+        told = settings.seeing_arcsec or TYPICAL_SEEING_ARCSEC
+        air = expected_air(settings.prior, seeing_arcsec=told, diameter_m=diameter_m)
+        if settings.prior.fried_m is not None:
+            told = SEEING_TO_FRIED * SEEING_WAVELENGTH_M / (settings.prior.fried_m * ARCSEC_RAD)
+            settings = settings.model_copy(update={"seeing_arcsec": told})
+        first = settings.model_copy(update={"gerchberg_saxton": options.capture, "unwrapping": "carried"})
+        level = finest_level(geometry, air, oversampling=options.oversampling, window=options.window, dtype=dtype)
+        capture = GerchbergSaxton.build(geometry, first, dtype=dtype)
+        if settings.prior.cutoff_cpa is None:
+            # What is told is where the measuring starts: taken as it is, half the seeing loses a tenth of the frames.
+            capture = dataclasses.replace(capture, measures_strength=True)
+        lit_cells = float(jnp.sum(level.light))
+        power = prior_power(
+            level.grid, settings.prior, air, wavelength_m=wavelength_m, diameter_m=diameter_m, lit_pixels=lit_cells
+        )
+        beyond = unmodelled_variance(air, wavelength_m=wavelength_m, cutoff_per_m=1 / (2 * level.grid.pixel_m))
+        over_fried = diameter_m / air.fried_at(wavelength_m)
+        return cls(
+            level=level,
+            capture=capture,
+            power=jnp.asarray(power, dtype),
+            tilt_rms_rad=jnp.asarray(math.sqrt(TILT_VARIANCE * over_fried ** (5 / 3)), dtype),
+            beyond_cells=jnp.asarray(beyond, dtype),
+            band=jnp.asarray(
+                speckle_band(Grid(level.measured_shape, geometry.frame.pixel_m), diameter_m=diameter_m), dtype
+            ),
+            error=MapError.build(geometry, settings, level, air, dtype=dtype),
+            settings=settings,
+            geometry=geometry,
+        )
+
+    def estimate(
+        self,
+        counts: Float[Array, "plane y x"],
+        usable: Bool[Array, "plane y x"],
+        *,
+        read_variance: float | Float[Array, ""] = 0.0,
+        start_m: Float[Array, "y x"] | None = None,
+    ) -> WavefrontEstimate:
+        """The wavefront behind one exposure.
+
+        Args:
+            counts: Photo-electrons on the frames' pixels, background subtracted.
+            usable: False for pixels to ignore.
+            read_variance: Variance of a pixel without light, electrons squared.
+            start_m: Wavefront to start from, same pixels; replaces the tilt of the centroids.
+
+        Returns:
+            The estimate on the frames' pixels.
+        """
+        found = self.found(self.capture.measurement(counts, usable, read_variance), start_m)
+        return self.account(found)
+
+    def found(self, near: Measurement, start_m: Float[Array, "y x"] | None = None) -> Found:
+        """All that the estimate is made of: first guess, solutions, healings."""
+        slope, climb = self.capture.search(near, start_m)
+        climb = eqx.tree_at(lambda c: c.strength, climb, self.measured_strength(near, climb))
+        task, unknown = self.prepared(near, slope, climb)
+        search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
+        return Found(task, search, slope, climb.strength)
+
+    def measured_strength(self, near: Measurement, climb: Climb) -> Float[Array, ""]:
+        """The strength that the first guess shows: the coarse levels on the way could not see its fine waves."""
+        level, strength = self.capture.levels[-1], climb.strength
+        if not self.capture.measures_strength:
+            return strength
+        weights = jnp.asarray(slope_weights(level.grid), strength.dtype)
+        noise = SENSOR_LOSS * phase_noise(level, near)
+        for _ in range(2):
+            strength = updated_strength(strength, climb.phase_rad, level.light, level.power[0], weights, noise)
+        return strength / SHOWN
+
+    def prepared(self, near: Measurement, slope: Float[Array, "2"], climb: Climb) -> tuple[Task, Unknown]:
+        """The task of one exposure and the first guess, on the grid of the model."""
+        level = self.level
+        fine = [size * level.oversampling for size in near.counts.shape[1:]]
+        phase_rad = jax.image.resize(climb.phase_rad, fine, method="cubic").astype(climb.phase_rad.dtype)
+        margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
+        phase_rad = jnp.pad(phase_rad, margins, mode="edge")
+        measured = near.padded(level.measured_shape)
+        known_rad = self.known_rad(slope)
+        scale = self.plane_scale(measured, known_rad + phase_rad)
+        prior = self.prior(self.power * climb.strength, self.tilt_rms_rad * jnp.sqrt(climb.strength))
+        task = self.task(measured, known_rad, scale, prior, climb.strength)
+        return task, prior.start(phase_rad, noise_variance=START_NOISE / task.problem.information)
+
+    def known_rad(self, slope: Float[Array, "2"]) -> Float[Array, "y x"]:
+        """The phase of a tilt and of the static aberration."""
+        wavelength_m, level = self.geometry.wavelength_m, self.level
+        return tilt_phase(slope, level.grid, wavelength_m) + level.optics.static_opd_m * (2 * np.pi / wavelength_m)
+
+    def plane_scale(self, measured: Measurement, phase_rad: Float[Array, "y x"]) -> PlaneScale:
+        """Counts and background of each plane, judged with a phase that is nearly right."""
+        options = self.settings.map
+        shares = self.level.optics.flux_fractions if options.flux == "given" else None
+        light = light_on_pixels(self.level, phase_rad)
+        return plane_scale(light, measured, fits_background=options.fits_background, shares=shares)
+
+    def prior(self, power: Float[Array, "y fx"], tilt_rms_rad: Float[Array, ""]) -> WhitenedPhase:
+        """Unknowns for this power."""
+        diameter_m = self.geometry.pupil.diameter_m
+        return WhitenedPhase.build(self.level.grid, power, tilt_rms_rad=tilt_rms_rad, diameter_m=diameter_m)
+
+    def task(
+        self,
+        measured: Measurement,
+        known_rad: Float[Array, "y x"],
+        scale: PlaneScale,
+        prior: WhitenedPhase,
+        strength: Float[Array, ""],
+    ) -> Task:
+        """What is to be solved for one exposure."""
+        level, lit = self.level, jnp.sum(self.level.light)
+        dark = self.settings.map.dark_share * scale.counts * level.oversampling**2 / lit + measured.read_variance
+        photons = jnp.sum(jnp.where(measured.usable, measured.counts, 0))
+        problem = gn.Problem(
+            expected=lambda phase_rad: mean_counts(level, scale, phase_rad),
+            counts=jnp.where(measured.usable, measured.counts, 0),
+            usable=measured.usable,
+            dark=jnp.maximum(dark, jnp.finfo(dark.dtype).tiny),
+            known_rad=known_rad,
+            prior=prior,
+            information=4 * jnp.maximum(photons, 1) / (SENSOR_LOSS * lit),
+        )
+        return Task(problem, level, measured, scale, self.beyond_cells * strength)
+
+    def account(self, found: Found) -> WavefrontEstimate:
+        """Wavefront, error bars and verdict of the best solution."""
+        task, best, strength = found.task, found.search.best, found.strength
+        wavelength_m = self.geometry.wavelength_m
+        phase_rad = task.problem.prior.phase_rad(best.unknown) + tilt_phase(found.slope, self.level.grid, wavelength_m)
+        metres = self.geometry.wavelength_m / (2 * np.pi)
+        opd_m = self.on_frame(phase_rad) * metres
+        light = self.on_frame(self.level.light)
+        opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
+        measured, shape = task.measured, self.geometry.frame.shape
+        unexplained = unexplained_share(measured, best.model, self.band)
+        code = map_verdict(
+            found.search, unexplained=unexplained, measured=measured, finite=jnp.all(jnp.isfinite(opd_m))
+        )
+        bars = self.error.bars(task, task.problem.known_rad + task.problem.prior.phase_rad(best.unknown), strength)
+        believed = (code == Outcome.CONVERGED) | (code == Outcome.BUDGET_SPENT)
+        told = self.error.told_rad(bars, strength, believed) * metres
+        residual = jnp.where(measured.usable, measured.counts - best.model, 0)
+        return WavefrontEstimate(
+            opd_m=opd_m,
+            predicted_error_m=told,
+            unexplained=unexplained,
+            residual=jnp.stack([cropped(plane, shape) for plane in residual]),
+            iterations=best.steps,
+            ffts=best.ffts + bars.ffts,
+            outcome_code=code,
+            strength=strength,
+            error_bars=bars,
+        )
+
+    def on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
+        """From the model's grid to the pixels of the frames: the mean over each."""
+        factor = self.level.oversampling
+        return cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)

@@ -1,0 +1,276 @@
+"""Frames in a row: what the last ones showed is expected of the next, so that a few FFTs a frame are enough."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nlcwfs.errors import SettingsError
+from nlcwfs.estimation import gauss_newton as gn
+from nlcwfs.estimation.fit_quality import unexplained_share
+from nlcwfs.estimation.frame_prediction import (
+    lasting_correlation,
+    posterior_power,
+    predicted_mean_and_power,
+    unseen_share,
+    wind_carriage,
+)
+from nlcwfs.estimation.map_solution import Task
+from nlcwfs.estimation.map_verdict import UNEXPLAINED
+from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
+from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.reconstructor import SENSOR_LOSS
+from nlcwfs.estimation.resolution_level import Measurement, cropped
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.sensor_model import PlaneScale
+from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.turbulence_filter import rms_of_power
+from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+from nlcwfs.estimation.whitened_phase import Unknown
+
+
+class Memory(eqx.Module):
+    """What is known when a frame has been seen.
+
+    Attributes:
+        phase_rad: Phase on the model's grid without tilt and static aberration.
+        slope: Tilt (y, x), metres per metre.
+        left_open: Power of the error of the phase.
+        tilt_left_rad: Rms error of the tilt along one axis.
+        strength: Variance of the turbulence over that of the prior.
+        scale: Counts of each plane over those measured, and background.
+    """
+
+    phase_rad: Float[Array, "y x"]
+    slope: Float[Array, "2"]
+    left_open: Float[Array, "y fx"]
+    tilt_left_rad: Float[Array, ""]
+    strength: Float[Array, ""]
+    scale: PlaneScale
+
+
+class SequenceReconstructor(eqx.Module):
+    """Reconstructs frames that follow each other, with a fixed number of FFTs for each after the first.
+
+    The first frame is reconstructed as if alone. From then on the prior of a frame is what the wind leaves of the last
+    estimate (`frame_prediction`), and a few Gauss-Newton steps from there are enough. In a closed loop the mirror's
+    shape is told as a known wavefront: what is followed is the whole turbulence, whose prior is known.
+
+    Attributes:
+        solver: Reconstructs single frames.
+        correlation: How much of each wave a frame shows again.
+        tilt_correlation: The same for the tilt.
+        inner: Conjugate gradients of each step.
+
+    Examples:
+        >>> from nlcwfs.beam.grid import Grid
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> geometry = SensorGeometry(PupilShape(8.0), Grid((32, 32), 0.36), 0.65e-6, (-3.5e6, -2.5e6, 2.5e6, 3.5e6))
+        >>> sequence = SequenceReconstructor.build(geometry, EstimationSettings(modes=100), interval_s=0.004)
+        >>> sequence.inner, sequence.ffts
+        (3, 97)
+    """
+
+    solver: MaximumAPosteriori
+    correlation: Array
+    tilt_correlation: float = eqx.field(static=True)
+    inner: int = eqx.field(static=True)
+    interval_s: float = eqx.field(static=True)
+
+    @classmethod
+    def build(
+        cls,
+        geometry: SensorGeometry,
+        settings: EstimationSettings,
+        *,
+        interval_s: float,
+        photons: float = 1e4,
+        dtype: str = "float32",
+    ) -> "SequenceReconstructor":
+        """Prepare for frames at equal intervals.
+
+        Args:
+            geometry: The sensor.
+            settings: Options; the wind is that of `settings.prior`.
+            interval_s: Time from frame to frame.
+            photons: About how many a frame has: with many, old frames are forgotten sooner.
+            dtype: Precision.
+
+        Raises:
+            SettingsError: If an option contradicts another, the interval is not positive, or the budget too small.
+            SamplingError: If the pupil does not fit on the frames.
+        """
+        if not interval_s > 0 or not photons > 0:
+            raise SettingsError("interval_s and photons", "must be positive", (interval_s, photons))
+        planes, options, prior = len(geometry.distances_m), settings.map, settings.prior
+        inner = inner_steps(planes, budget=options.ffts_per_frame, steps=options.sequence_steps)
+        solver = MaximumAPosteriori.build(geometry, settings, dtype=dtype)
+        grid, speed, diameter_m = solver.level.grid, prior.wind_speed_m_per_s, geometry.pupil.diameter_m
+        if prior.wind_direction_deg is None:
+            information = 4 * photons / (SENSOR_LOSS * float(jnp.sum(solver.level.light)))
+            power = np.asarray(solver.power, float)
+            again = lasting_correlation(grid, power, information=information, wind_m_per_s=speed, interval_s=interval_s)
+        else:
+            angle = np.deg2rad(prior.wind_direction_deg)
+            layers = [(1.0, speed * np.sin(angle), speed * np.cos(angle))]
+            again = wind_carriage(grid, layers, interval_s=interval_s)
+        new = unseen_share(diameter_m=diameter_m, wind_m_per_s=speed, interval_s=interval_s)
+        moved = np.pi * speed * interval_s / diameter_m
+        again = np.asarray(again) * np.sqrt(1 - new)
+        kind = np.result_type(dtype, np.complex64) if np.iscomplexobj(again) else dtype
+        return cls(
+            solver=solver,
+            correlation=jnp.asarray(again, kind),
+            tilt_correlation=float(np.exp(-(moved**2) / 2)),
+            inner=inner,
+            interval_s=interval_s,
+        )
+
+    @property
+    def ffts(self) -> int:
+        """FFTs of every frame after the first."""
+        planes = self.solver.level.optics.transfer.shape[1]
+        return fixed_ffts(planes, inner=self.inner, steps=self.solver.settings.map.sequence_steps)
+
+    def start(
+        self,
+        counts: Float[Array, "plane y x"],
+        usable: Bool[Array, "plane y x"],
+        *,
+        read_variance: float | Float[Array, ""] = 0.0,
+    ) -> tuple[WavefrontEstimate, Memory]:
+        """The wavefront of a first frame, and what it tells of the next."""
+        solver = self.solver
+        found = solver.found(solver.capture.measurement(counts, usable, read_variance))
+        task, unknown, strength = found.task, found.search.best.unknown, found.strength
+        total = _plane_counts(task.measured)
+        scale = PlaneScale(task.scale.counts / total, task.scale.background)
+        rms_rad = solver.tilt_rms_rad * jnp.sqrt(strength)
+        memory = self._remembered(task, unknown, found.slope, jnp.zeros_like(task.problem.known_rad), rms_rad)
+        return solver.account(found), Memory(*memory, strength, scale)
+
+    def follow(
+        self,
+        counts: Float[Array, "plane y x"],
+        usable: Bool[Array, "plane y x"],
+        memory: Memory,
+        *,
+        read_variance: float | Float[Array, ""] = 0.0,
+        known_m: Float[Array, "y x"] | None = None,
+    ) -> tuple[WavefrontEstimate, Memory]:
+        """The wavefront of the next frame, in a fixed number of FFTs, and what it tells of the one after.
+
+        Args:
+            counts: Photo-electrons on the frames' pixels, background subtracted.
+            usable: False for pixels to ignore.
+            memory: What the frame before has told.
+            read_variance: Variance of a pixel without light, electrons squared.
+            known_m: Wavefront on the model's grid that is added to what is followed: minus the shape of a mirror.
+
+        Returns:
+            The wavefront that the sensor saw, `known_m` included, and the memory of what is followed, without it.
+        """
+        solver, options = self.solver, self.solver.settings.map
+        level, wavelength_m = solver.level, self.solver.geometry.wavelength_m
+        expected = self.skip(memory)
+        measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
+        known_rad = solver.known_rad(memory.slope) + expected.phase_rad
+        if known_m is not None:
+            known_rad = known_rad + known_m.astype(known_rad.dtype) * (2 * np.pi / wavelength_m)
+        prior = solver.prior(expected.left_open, expected.tilt_left_rad)
+        total = _plane_counts(measured)
+        scale = PlaneScale(memory.scale.counts * total, memory.scale.background)
+        task = solver.task(measured, known_rad, scale, prior, memory.strength)
+        unknown = prior.nothing()
+        for _ in range(options.sequence_steps):
+            direction, _ = gn.direction_of_step(task.problem, self.inner, unknown)
+            unknown = gn.plus(unknown, direction, 1.0)
+        parts = self._remembered(task, unknown, memory.slope, expected.phase_rad, expected.tilt_left_rad)
+        estimate = self._account(task, unknown, parts, memory.strength)
+        return estimate, Memory(*parts, memory.strength, memory.scale)
+
+    def skip(self, memory: Memory) -> Memory:
+        """What is expected one interval later; call it for every frame that is missing."""
+        solver = self.solver
+        power = solver.power * memory.strength
+        mean_rad, left_open = predicted_mean_and_power(memory.phase_rad, memory.left_open, power, self.correlation)
+        again = self.tilt_correlation**2
+        tilt = solver.tilt_rms_rad**2 * memory.strength
+        tilt_left_rad = jnp.sqrt(again * memory.tilt_left_rad**2 + (1 - again) * tilt)
+        return Memory(mean_rad, memory.slope, left_open, tilt_left_rad, memory.strength, memory.scale)
+
+    def _remembered(
+        self, task: Task, unknown: Unknown, slope: Float[Array, "2"], mean_rad: Float[Array, "y x"], rms_rad: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Phase, slope and what is left open of both."""
+        problem, prior, level = task.problem, task.problem.prior, self.solver.level
+        phase_rad = mean_rad + prior.phase_rad(Unknown(unknown.waves, jnp.zeros_like(unknown.slope)))
+        diameter_m, wavelength_m = self.solver.geometry.pupil.diameter_m, self.solver.geometry.wavelength_m
+        # A tilt of unit rms over a disc is 2 r / R (Noll).
+        slope = slope + unknown.slope * rms_rad * (4 / diameter_m * wavelength_m / (2 * np.pi))
+        left_open = posterior_power(prior.amplitude**2, problem.information)
+        seen = problem.information * jnp.sum(level.light)
+        return phase_rad, slope, left_open, jnp.sqrt(rms_rad**2 / (1 + rms_rad**2 * seen))
+
+    def _account(self, task: Task, unknown: Unknown, parts: tuple, strength: Float[Array, ""]) -> WavefrontEstimate:
+        """Wavefront, expected error and verdict of a frame that was followed."""
+        solver, problem = self.solver, task.problem
+        geometry = solver.geometry
+        metres = geometry.wavelength_m / (2 * np.pi)
+        whole_rad = problem.known_rad + problem.prior.phase_rad(unknown)
+        model = problem.expected(whole_rad)
+        light = solver.on_frame(solver.level.light)
+        opd_m = solver.on_frame(whole_rad) * metres - solver.on_frame(solver.level.optics.static_opd_m)
+        opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
+        unexplained = unexplained_share(task.measured, model, solver.band)
+        code = jnp.where(unexplained > UNEXPLAINED, Outcome.NOT_EXPLAINED, Outcome.BUDGET_SPENT)
+        dark = jnp.any(jnp.sum(jnp.where(task.measured.usable, problem.counts, 0), axis=(1, 2)) <= 0)
+        code = jnp.where(dark, Outcome.NO_LIGHT, code)
+        code = jnp.where(jnp.all(jnp.isfinite(opd_m)), code, Outcome.NOT_FINITE).astype(jnp.int32)
+        left = rms_of_power(parts[2], solver.level.grid) ** 2 + 2 * parts[3] ** 2 + task.beyond
+        residual = jnp.where(task.measured.usable, problem.counts - model, 0)
+        return WavefrontEstimate(
+            opd_m=opd_m,
+            predicted_error_m=jnp.sqrt(left) * metres,
+            unexplained=unexplained,
+            residual=jnp.stack([cropped(plane, geometry.frame.shape) for plane in residual]),
+            iterations=jnp.asarray(solver.settings.map.sequence_steps, jnp.int32),
+            ffts=jnp.asarray(self.ffts, jnp.int32),
+            outcome_code=code,
+            strength=strength,
+        )
+
+
+def fixed_ffts(planes: int, *, inner: int, steps: int) -> int:
+    """FFTs of a frame that is followed: steps, the prediction, the model at the end.
+
+    Examples:
+        >>> fixed_ffts(4, inner=3, steps=2)
+        97
+    """
+    return steps * (gn.ffts_per_step(planes, inner)) + planes + 5
+
+
+def inner_steps(planes: int, *, budget: int, steps: int) -> int:
+    """Conjugate gradients of each step that a budget of FFTs allows.
+
+    Raises:
+        SettingsError: If it does not allow one.
+
+    Examples:
+        >>> inner_steps(4, budget=100, steps=2)
+        3
+    """
+    inner = 0
+    while fixed_ffts(planes, inner=inner + 1, steps=steps) <= budget:
+        inner += 1
+    if inner == 0:
+        least = fixed_ffts(planes, inner=1, steps=steps)
+        rule = f"must be at least {least} for {planes} planes and {steps} steps"
+        raise SettingsError("estimation.map.ffts_per_frame", rule, budget)
+    return inner
+
+
+def _plane_counts(measured: Measurement) -> Float[Array, "plane 1 1"]:
+    counts = jnp.sum(jnp.where(measured.usable, measured.counts, 0), axis=(1, 2), keepdims=True)
+    return jnp.maximum(counts, jnp.finfo(counts.dtype).tiny)
