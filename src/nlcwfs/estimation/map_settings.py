@@ -35,7 +35,7 @@ class MapSettings(BaseModel):
         description="stop when a step promises less than this many nats for each mode that the light shows",
     )
     dark_share: float = Field(
-        default=0.03,
+        default=0.01,
         ge=0,
         le=10,
         description="share of the mean count that counts as noise everywhere: light of the turbulence that is finer "
