@@ -3,12 +3,25 @@
 import math
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from nlcwfs.config import Config, load_config
-from nlcwfs.errors import FileFormatError
+from nlcwfs.errors import FileFormatError, SettingsError
+
+
+class Capture(NamedTuple):
+    """When a wavefront counts as found.
+
+    Attributes:
+        captured_nm: Its error is below this.
+        score: Which error judges what is believed: on the grid of the light (`fine`), or of the mean over every
+            detector pixel (`pixels`).
+    """
+
+    captured_nm: float
+    score: Literal["fine", "pixels"] = "fine"
 
 
 class Case(BaseModel):
@@ -47,6 +60,7 @@ class Study(BaseModel):
         groups: Heading of each group of cases.
         screens: Screens of a case, unless it says otherwise.
         captured_nm: Error below which a screen counts as captured.
+        score: Which error that is, see `Capture`.
         set: Settings that all cases share.
         case: The cases.
     """
@@ -59,8 +73,14 @@ class Study(BaseModel):
     groups: dict[str, str] = {}
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
+    score: Literal["fine", "pixels"] = "fine"
     set: tuple[str, ...] = ()
     case: tuple[Case, ...]
+
+    @property
+    def capture(self) -> Capture:
+        """When a screen counts as captured."""
+        return Capture(self.captured_nm, self.score)
 
     def screens_of(self, case: Case) -> int:
         """How many screens a case takes."""
@@ -79,6 +99,33 @@ class Study(BaseModel):
         rms_nm = wavelength_nm / (2 * math.pi) * math.sqrt(1.0299 * case.telescope_over_fried ** (5 / 3))
         return load_config(None, [*self.set, *case.set, f"atmosphere.opd_rms_nm={rms_nm!r}"])
 
+    def configs(self, path: Path) -> dict[str, Config]:
+        """The configuration of every case, by its name.
+
+        Args:
+            path: The study's file, for the message.
+
+        Raises:
+            FileFormatError: If a setting is impossible; names the file and the case.
+        """
+        configs = {}
+        for case in self.case:
+            try:
+                configs[case.name] = self.config_of(case)
+            except SettingsError as error:
+                where = "set" if str(error) == self._shared_problem() else f"case {case.name}"
+                reason = "; ".join(str(error).splitlines())
+                raise FileFormatError(f"{path}: {where}: {reason}") from None
+        return configs
+
+    def _shared_problem(self) -> str:
+        """What is wrong with the settings that all cases share."""
+        try:
+            load_config(None, self.set)
+        except SettingsError as error:
+            return str(error)
+        return ""
+
 
 def read_study(folder: Path) -> Study:
     """The study of a folder.
@@ -90,7 +137,7 @@ def read_study(folder: Path) -> Study:
     if not path.is_file():
         raise FileFormatError(f"{path}: must exist, got no such file")
     try:
-        content: dict[str, Any] = tomllib.loads(path.read_text())
+        content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
         study = Study.model_validate(content, strict=False)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path}: must be TOML, got {error}") from None

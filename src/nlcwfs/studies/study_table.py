@@ -1,13 +1,19 @@
 """The table of a study: one row a case, stamped, kept on disk after each, so that a study resumes."""
 
+import io
+import math
 from pathlib import Path
 
 import astropy.units as u
 from astropy.table import Table
 
+from nlcwfs.errors import FileFormatError
 from nlcwfs.interop import Provenance, atomic_write
 
 Row = dict[str, str | int | float]
+
+LAST = ("commit", "digest")
+"""Columns at the end of the table, whatever columns join later."""
 
 
 class StudyTable:
@@ -15,16 +21,17 @@ class StudyTable:
 
     Attributes:
         path: The ECSV file.
-        rows: What it holds.
+        rows: What it holds; a row that is older than a column has NaN there, or no text.
+
+    Raises:
+        FileFormatError: If the file is there and is no such table.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows: list[Row] = []
         if path.is_file():
-            table = Table.read(path, format="ascii.ecsv")
-            names = list(table.colnames)
-            self.rows = [dict(zip(names, values, strict=True)) for values in table.iterrows()]
+            self.rows = _read(path)
 
     def holds(self, name: str, digest: str) -> bool:
         """Whether the table has this case with these settings."""
@@ -44,8 +51,32 @@ class StudyTable:
             self._write(provenance)
 
     def _write(self, provenance: Provenance) -> None:
-        columns = {name: [row[name] for row in self.rows] for name in self.rows[0]}
+        names = list(dict.fromkeys(name for row in self.rows for name in row if name not in LAST))
+        names += [name for name in LAST if name in self.rows[0]]
+        columns = {name: _filled([row.get(name) for row in self.rows]) for name in names}
         units = {name: u.nm for name in columns if name.endswith("_nm")}
+        text = io.StringIO()
         table = Table(columns, units=units, meta={"provenance": provenance.as_dict()})
+        table.write(text, format="ascii.ecsv")
         with atomic_write(self.path) as temporary:
-            table.write(temporary, format="ascii.ecsv", overwrite=True)
+            temporary.write_text(text.getvalue(), encoding="utf-8")
+
+
+def _read(path: Path) -> list[Row]:
+    try:
+        table = Table.read(path.read_text(encoding="utf-8").splitlines(), format="ascii.ecsv")
+    except Exception as error:  # astropy and its YAML have a dozen kinds
+        reason = " ".join(str(error).split())[:200]
+        raise FileFormatError(f"{path}: must be the table of a study (delete it to start anew), got {reason}") from None
+    names = list(table.colnames)
+    missing = [name for name in ("case", "group", "digest") if name not in names]
+    if missing:
+        rule = f"must have the columns case, group and digest (delete it to start anew), got no {missing[0]}"
+        raise FileFormatError(f"{path}: {rule}")
+    return [dict(zip(names, values, strict=True)) for values in table.iterrows()]
+
+
+def _filled(values: list[str | int | float | None]) -> list[str | int | float]:
+    """Something for rows that are older than the column."""
+    nothing = "" if any(isinstance(value, str) for value in values) else math.nan
+    return [nothing if value is None else value for value in values]
