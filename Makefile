@@ -36,6 +36,7 @@ pytest: $(VENV)/.installed-dev  ## Tests and the examples in the docstrings
 
 studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that take minutes
 	$(BIN)/nlcwfs study studies/01-single-frame
+	$(BIN)/nlcwfs study studies/02-every-method
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs

@@ -58,6 +58,7 @@ class Study(BaseModel):
         answer: The first line of its page, written when the table is there.
         notes: The end of its page.
         groups: Heading of each group of cases.
+        figures: What to draw of the table, see `study_figures`.
         screens: Screens of a case, unless it says otherwise.
         captured_nm: Error below which a screen counts as captured.
         score: Which error that is, see `Capture`.
@@ -71,6 +72,7 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
+    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration"], ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
     score: Literal["fine", "pixels"] = "fine"
