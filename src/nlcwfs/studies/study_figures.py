@@ -1,140 +1,55 @@
-"""Figures drawn from the table of study 01."""
+"""The figures that a study asks for, drawn from its table."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from nlcwfs.interop import atomic_write
+from nlcwfs.studies.accelerator_figures import draw_convergence, draw_light_and_turbulence
+from nlcwfs.studies.method_figures import draw_calibration, draw_cost
+from nlcwfs.studies.study_cases import Study
 from nlcwfs.studies.study_table import Row, StudyTable
 
-CURVES = {
-    "flat-serial": "plain, from flat",
-    "tilt-serial": "plain, from the tilt",
-    "tilt-serial-fast-forward": "+ fast-forward",
-    "tilt-serial-binned": "+ binned images first",
-    "tilt-serial-low-pass": "+ low-pass at 16 CPA",
-    "tilt-averaged": "averaged over planes",
-    "tilt-averaged-fast-forward": "averaged + fast-forward",
-    "ladder": "default: coarse to fine, filtered",
+FIGURES: dict[str, tuple[Callable[[list[Row]], Figure | None], str]] = {
+    "convergence": (
+        draw_convergence,
+        "Captured screens and median error against the FFTs of one plane: D/r0 = 8.2, 2e4 photons, 45 pixels, "
+        "light on a grid four times finer. Dashed line: photon bound (Bayesian Cramer-Rao) for the same light.",
+    ),
+    "photons-and-turbulence": (
+        draw_light_and_turbulence,
+        "Median error (bars: 5 to 95 % of the screens) against photons at D/r0 = 8.2, and against the rms of the "
+        "wavefront at 2e4 photons. Dashed: photon bounds (Bayesian Cramer-Rao) for the same light.",
+    ),
+    "cost": (
+        draw_cost,
+        "Error of the mean over each detector pixel (median; bands: 16 to 84 % of the screens) and share of the "
+        "screens that are captured, against FFTs of one plane for each frame: D/r0 = 8.2, 45 pixels, light on a "
+        "grid four times finer. Dashed: photon bound (Bayesian Cramer-Rao); dotted: quantum limit.",
+    ),
+    "calibration": (
+        draw_calibration,
+        "Error over predicted error, rms over the screens that are believed: 1 is honest, more is too proud. Left: "
+        "the most likely wavefront, whole and by the spatial frequency of the modes. Right: every method, whole.",
+    ),
 }
-"""Families of the group `convergence`, by the start of their names."""
+"""What draws a figure, None where its rows are missing, and its caption."""
 
 
-def draw_figures(folder: Path, table: StudyTable) -> dict[str, str]:
-    """Draw every figure whose rows are there.
+def draw_figures(folder: Path, study: Study, table: StudyTable) -> dict[str, str]:
+    """Draw every figure of a study whose rows are there.
 
     Returns:
         The caption of each picture, by file name.
     """
     captions = {}
-    groups = {str(row["group"]) for row in table.rows}
-    if "convergence" in groups:
-        _save(_convergence(table), folder / "convergence.png")
-        captions["convergence.png"] = (
-            "Captured screens and median error against the FFTs of one plane: D/r0 = 8.2, 2e4 photons, 45 pixels, "
-            "light on a grid four times finer. Dashed line: photon bound (Bayesian Cramer-Rao) for the same light."
-        )
-    if {"photons", "rms"} <= groups:
-        _save(_light_and_turbulence(table), folder / "photons-and-turbulence.png")
-        captions["photons-and-turbulence.png"] = (
-            "Median error (bars: 5 to 95 % of the screens) against photons at D/r0 = 8.2, and against the rms of the "
-            "wavefront at 2e4 photons. Dashed: photon bounds (Bayesian Cramer-Rao) for the same light."
-        )
-    return captions
-
-
-def family(name: str) -> tuple[str, int]:
-    """The curve a case belongs to, and its number.
-
-    Examples:
-        >>> family("tilt-serial-binned-40")
-        ('tilt-serial-binned', 40)
-    """
-    start, _, number = name.rpartition("-")
-    return start, int(number)
-
-
-def _convergence(table: StudyTable) -> Figure:
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    rows = [row for row in table.rows if row["group"] == "convergence"]
-    for number, (start, label) in enumerate(CURVES.items()):
-        curve = sorted((r for r in rows if family(str(r["case"]))[0] == start), key=lambda r: float(r["ffts"]))
-        if not curve:
+    for name in study.figures:
+        draw, caption = FIGURES[name]
+        figure = draw(table.rows)
+        if figure is None:
             continue
-        style = {"color": f"C{number}", "marker": "o", "markersize": 3.5, "label": label}
-        if start == "ladder":
-            style |= {"color": "black", "linewidth": 2.2}
-        left.plot(_column(curve, "ffts"), 100 * _column(curve, "captured"), **style)
-        right.plot(_column(curve, "ffts"), _column(curve, "median_nm"), **style)
-    for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_xlabel("FFTs of one plane")
-        axes.grid(alpha=0.3)
-    left.set_ylabel("screens below 60 nm [%]")
-    left.set_ylim(0, 102)
-    right.set_ylabel("median error of all screens [nm]")
-    _log_nm(right, (20, 30, 50, 100, 200))
-    bound = [float(row["bound_nm"]) for row in table.rows if row["case"] == "paper-8.2"]
-    if bound and np.isfinite(bound[0]):
-        right.axhline(bound[0], color="gray", linestyle="--", linewidth=1)
-        right.annotate("photon bound", (0.02, bound[0] * 1.03), xycoords=("axes fraction", "data"), color="gray")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return figure
-
-
-def _light_and_turbulence(table: StudyTable) -> Figure:
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    photons = [row for row in table.rows if row["group"] == "photons"]
-    for color, ending, label in (("C0", "45px", "default, 45 pixels"), ("C1", "90px", "default, 90 pixels"),
-                                 ("C2", "45px-plain", "plain GS, 45 pixels")):  # fmt: skip
-        rows = [row for row in photons if str(row["case"]).split("-", 2)[2] == ending]
-        _curve(left, rows, _column(rows, "photons"), color, label)
-    left.set_xscale("log")
-    left.set_xlabel("photons in the exposure")
-    rms = [row for row in table.rows if row["group"] == "rms"]
-    for color, plain, label in (("C0", False, "default, 45 pixels"), ("C2", True, "plain GS, 45 pixels")):
-        ending = ["plain"] if plain else []
-        rows = [row for row in rms if str(row["case"]).split("-")[2:] == ending]
-        at_nm = np.array([float(str(row["case"]).split("-")[1]) for row in rows])
-        _curve(right, rows, at_nm, color, label)
-    right.set_xlabel("mean rms of the wavefront, tilt included [nm]")
-    for axes in (left, right):
-        axes.set_ylabel("error [nm rms]")
-        _log_nm(axes, (5, 10, 20, 30, 50, 100, 200))
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, frameon=False)
-    return figure
-
-
-def _curve(axes: Axes, rows: Sequence[Row], at: np.ndarray, color: str, label: str) -> None:
-    if not rows:
-        return
-    median = _column(rows, "median_nm")
-    bars = np.stack([median - _column(rows, "p5_nm"), _column(rows, "p95_nm") - median])
-    axes.errorbar(at, median, yerr=bars, color=color, marker="o", markersize=4, capsize=2, linewidth=1.2, label=label)
-    bound = _column(rows, "bound_nm")
-    known = np.isfinite(bound)
-    if known.any():
-        axes.plot(at[known], bound[known], color=color, linestyle="--", linewidth=1)
-
-
-def _log_nm(axes: Axes, ticks: Sequence[int]) -> None:
-    """A logarithmic axis with plain numbers at these places only."""
-    axes.set_yscale("log")
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_yticks(ticks, [str(tick) for tick in ticks])
-
-
-def _column(rows: Sequence[Row], name: str) -> np.ndarray:
-    return np.array([float(row[name]) for row in rows])
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png")
+        with atomic_write(folder / f"{name}.png") as temporary:
+            figure.savefig(temporary, dpi=150, format="png")
+        captions[f"{name}.png"] = caption
+    return captions

@@ -38,7 +38,7 @@ def run_study(
     """
     study = read_study(folder)
     configs = study.configs(folder / "study.toml")
-    table = StudyTable(folder / ("results.ecsv" if screens is None else "quick.ecsv"))
+    table = StudyTable(table_path(folder, screens))
     seeds = {config.seed for config in configs.values()}
     seed = seeds.pop() if len(seeds) == 1 else None  # cases may each have their own: it is in their settings
     stamp = Provenance.collect(study.model_dump(mode="json"), seed=seed, device=jax.devices()[0].device_kind)
@@ -61,6 +61,16 @@ def run_study(
     if not only and table.rows:
         table.sort([case.name for case in study.case], stamp)
     return table
+
+
+def table_path(folder: Path, screens: int | None) -> Path:
+    """The table of a study, or that of quick looks at it, which no repository keeps.
+
+    Examples:
+        >>> table_path(Path("studies/01-single-frame"), None).name, table_path(Path("."), 2).name
+        ('results.ecsv', 'quick.ecsv')
+    """
+    return folder / ("results.ecsv" if screens is None else "quick.ecsv")
 
 
 def case_digest(study: Study, case: Case, config: Config, count: int) -> str:
