@@ -88,20 +88,23 @@ def reconstruct(
         Path | None, typer.Option(metavar="FILE.toml", help="Settings, of which [estimation] counts.")
     ] = None,
     settings: SetOption = None,
-    method: Annotated[str | None, typer.Option(help="How: gerchberg-saxton.")] = None,
+    method: Annotated[str | None, typer.Option(help="How: map (default), gerchberg-saxton, or linear.")] = None,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="Frames follow each other (RATE or TIME): each starts from the last.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on after an interruption, with the same --out.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Reconstruct the wavefront behind the frames of a sensor.
 
-    Telescope, planes and pixels are read from the header. Each frame is an exposure of its own. Ctrl-C keeps what is
-    done.
+    Telescope, planes and pixels are read from the header. Each frame is an exposure of its own, unless --sequence says
+    that they follow each other. Ctrl-C keeps what is done.
     """
     from nlcwfs.commands.reconstruct import ReconstructOptions, read_estimation
     from nlcwfs.commands.reconstruct import reconstruct as run
 
     chosen = read_estimation(config, settings or [], method)
-    raise typer.Exit(run(chosen, ReconstructOptions(frames, out, plot, resume, quiet)).exit_code)
+    raise typer.Exit(run(chosen, ReconstructOptions(frames, out, plot, resume, quiet, sequence)).exit_code)
 
 
 @app.command()

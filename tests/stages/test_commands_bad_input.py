@@ -97,7 +97,7 @@ OPTIONS = {
         'estimation.modes: must be a whole number from 1 to 20000, got "many"',
     ),
     "no equals sign": (("--set", "estimation.modes"), "--set: must be section.key=value"),
-    "method": (("--method", "magic"), "--method: must be gerchberg-saxton, got magic"),
+    "method": (("--method", "magic"), "--method: must be map or gerchberg-saxton or linear, got magic"),
     "no folder": (("--out", "nowhere/w.fits"), "nowhere/w.fits: output folder must exist"),
     "the frames themselves": (("--out", "frames.fits"), "--out: must not overwrite the frames, got frames.fits"),
     "kind of picture": (("--plot", "p.gif"), "--plot: must end in .png, .pdf, .svg, .jpg, got p.gif"),

@@ -96,7 +96,8 @@ def test_tilt_and_coma_come_back_the_right_way_round(tmp_path):
     given_frames(tmp_path / "f.fits", wavefront)
     # Bright and nearly flat on pixels of 33 cm: the strength would be measured from the model's own errors.
     seeing = fits.getheader(tmp_path / "f.fits")["SEEING"]
-    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits", "--set", f"estimation.seeing_arcsec={seeing}")
+    options = ("--set", f"estimation.seeing_arcsec={seeing}", "--method", "gerchberg-saxton")
+    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits", *options)
     with fits.open(tmp_path / "w.fits") as hdus:
         opd_m, modes = hdus[0].data, hdus["MODES"].data
         coefficient = dict(zip(modes["noll"], modes["coefficient_m"], strict=True))
@@ -110,9 +111,10 @@ def test_tilt_and_coma_come_back_the_right_way_round(tmp_path):
     assert error_nm(tmp_path / "w.fits", tmp_path / "f.fits") < 20
 
 
-def test_the_sigma_of_the_modes_is_that_of_the_photons(tmp_path):
+def test_the_sigma_of_the_modes_is_that_of_the_photons_where_the_method_tells_none(tmp_path):
     small_frames(tmp_path / "f.fits")
-    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits")
+    reconstructed(tmp_path / "f.fits", tmp_path / "w.fits", "--method", "gerchberg-saxton")
+    assert not {"QLIMIT", "PHOTLOSS"} & set(fits.getheader(tmp_path / "w.fits"))
     with fits.open(tmp_path / "w.fits") as hdus:
         modes = hdus["MODES"].data
     electrons = fits.getdata(tmp_path / "f.fits").sum()
@@ -183,7 +185,9 @@ def test_an_obstruction_in_the_header_alone_is_as_good_as_a_map(tmp_path):
         assert hdus[0].header["CENOBS"] == pytest.approx(0.3)
         fits.HDUList([hdu.copy() for hdu in hdus if hdu.name != "PUPIL"]).writeto(tmp_path / "g.fits")
     for name in "fg":
-        reconstructed(tmp_path / f"{name}.fits", tmp_path / f"w{name}.fits")
+        # Its model has the pixels of the map; the finer one of the default sees that the rim of a map has steps.
+        options = ("--method", "gerchberg-saxton")
+        reconstructed(tmp_path / f"{name}.fits", tmp_path / f"w{name}.fits", *options)
     one, two = (fits.getdata(tmp_path / f"w{name}.fits") for name in "fg")
     assert np.isnan(one[18, 18])  # behind the obstruction
     np.testing.assert_allclose(one, two, atol=1e-9)

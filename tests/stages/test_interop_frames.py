@@ -62,6 +62,8 @@ def full_record():
         exposure_s=1e-3,
         seeing_arcsec=0.8,
         rate_hz=500.0,
+        photons=16000.0,
+        times_s=np.array([4.25, 4.254]),
         pupil=rng.uniform(0.5, 1.0, (HEIGHT, WIDTH)) * (np.abs(np.arange(WIDTH) - 6.5) < 5),
         background=rng.uniform(0.0, 2.0, (PLANES, HEIGHT, WIDTH)),
         bad_pixels=bad,
@@ -155,6 +157,7 @@ def test_the_written_file_holds_the_contract(tmp_path):
             "EXPTIME": 1e-3,
             "SEEING": 0.8,
             "RATE": 500.0,
+            "PHOTONS": 16000.0,
             "SEED": 5,
             "DEVICE": "cpu",
             "CFGHASH": STAMP.settings_digest,
@@ -168,6 +171,7 @@ def test_the_written_file_holds_the_contract(tmp_path):
         np.testing.assert_array_equal(hdus["BADPIX"].data, record.bad_pixels.astype(int))
         np.testing.assert_array_equal(hdus["TRUTH"].data, record.truth_m)
         assert hdus["TRUTH"].header["BUNIT"] == "m"
+        np.testing.assert_array_equal(hdus["TIME"].data, record.times_s)
 
 
 def test_ds9_places_the_pixels_at_the_scale_of_the_telescope(tmp_path):
@@ -286,7 +290,7 @@ def test_doubtful_optics_are_told(tmp_path):
     pupil = read_frames(write(tmp_path / "c.fits", light(), ("PUPIL", small))).warnings
     assert pupil == ("PUPIL: is 2.4 m wide, but TELDIAM is 8 m; is PIXSCALE right?",)
     other = read_frames(write(tmp_path / "d.fits", light(), ("PUPILLE", small))).warnings
-    assert other == ("PUPILLE: is not one of PUPIL, BACKGROUND, BADPIX, TRUTH, ignored",)
+    assert other == ("PUPILLE: is not one of PUPIL, BACKGROUND, BADPIX, TRUTH, TIME, ignored",)
     uneven = light() * np.array([0.1, 1, 1])[:, None, None]
     shares = read_frames(write(tmp_path / "e.fits", uneven)).warnings
     assert len(shares) == 1

@@ -1,7 +1,6 @@
 """`nlcwfs reconstruct`: from the frames of a sensor to wavefronts, with what can be said about their errors."""
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +12,18 @@ from nlcwfs.commands.console import (
     NOT_A_SUCCESS,
     complain,
     device,
-    percent,
     say,
     tracked,
     undisturbed,
     use_precision,
     warn,
     working,
+)
+from nlcwfs.commands.reconstruct_report import (
+    frame_warnings,
+    header_lines,
+    result_lines,
+    sequence_line,
 )
 from nlcwfs.config import Config, load_config
 from nlcwfs.errors import FileFormatError, SettingsError
@@ -35,15 +39,14 @@ from nlcwfs.interop import (
     settings_digest,
     write_wavefront,
 )
+from nlcwfs.interop.frame_times import frame_times
 from nlcwfs.interop.frames_reconstruction import FramesReconstructor, is_success
+from nlcwfs.interop.sequence_reconstruction import SequenceRun
 
-METHODS = ("gerchberg-saxton",)
+METHODS = ("map", "gerchberg-saxton", "linear")
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 OWN_KEYS = ("estimation", "precision")
 """What frames do not say of themselves."""
-
-FEW_FRAMES = 20
-"""Up to here each frame gets a line, beyond only those that failed."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class ReconstructOptions:
     plot: Path | None = None
     resume: bool = False
     quiet: bool = False
+    sequence: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,14 +80,17 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
     """
     check_outputs(options)
     frames = read_frames(options.frames)
+    work = prepared(config, options, frames)
+    reconstructor = work.single if isinstance(work, SequenceRun) else work
     for line in frame_warnings(frames):
         warn(f"{options.frames}: {line}")
-    reconstructor = FramesReconstructor.build(frames, config.estimation, dtype=use_precision(config.precision))
-    settings = {"estimation": reconstructor.settings.model_dump(mode="json"), "precision": config.precision}
+    settings = {"estimation": config.estimation.model_dump(mode="json"), "precision": config.precision}
+    settings |= {"sequence": True} if options.sequence else {}
     done = finished_before(options, frames, settings_digest(settings)) if options.resume else {}
-    for line in header_lines(frames, reconstructor, already=len(done)):
+    told = [sequence_line(work.times, work.solver.ffts)] if isinstance(work, SequenceRun) else []
+    for line in [*header_lines(frames, reconstructor, already=len(done)), *told]:
         say(line, quiet=options.quiet)
-    interrupted = run(reconstructor, done, quiet=options.quiet)
+    interrupted = run(work, frames, done, quiet=options.quiet)
     with undisturbed():
         wavefront = WavefrontFile.from_frames(done, frames, method=config.estimation.method, noll=reconstructor.noll)
         if done:
@@ -105,6 +112,20 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
     say(f"Wrote {' and '.join(written)}.", quiet=options.quiet)
     good = all(is_success(outcome) for outcome in wavefront.outcomes)
     return Result(frames, wavefront, 0 if good else NOT_A_SUCCESS)
+
+
+def prepared(config: Config, options: ReconstructOptions, frames: FramesFile) -> FramesReconstructor | SequenceRun:
+    """Everything that the frames share.
+
+    Raises:
+        NlcwfsError: If a setting cannot be used, or frames that shall be a sequence have no clock.
+    """
+    dtype = use_precision(config.precision)
+    times = frame_times(frames, options.frames) if options.sequence else None
+    with working("Preparing for this sensor", quiet=options.quiet):
+        if times is not None:
+            return SequenceRun.build(frames, config.estimation, times, dtype=dtype)
+        return FramesReconstructor.build(frames, config.estimation, dtype=dtype)
 
 
 def read_estimation(path: Path | None, overrides: Sequence[str], method: str | None) -> Config:
@@ -144,17 +165,6 @@ def check_outputs(options: ReconstructOptions) -> None:
         raise SettingsError("--plot", "must be another file than --out", options.plot)
 
 
-def frame_warnings(frames: FramesFile) -> list[str]:
-    """What the user should know about the frames before believing a wavefront."""
-    found = list(frames.warnings)
-    if frames.bandwidth_m > 0:
-        found.append(f"BANDWID: {frames.bandwidth_m:g} m are treated as one colour, {frames.wavelength_m:g} m")
-    found += [f"frame {number} is left out: it {problem}" for number, problem in frames.frame_problems.items()][:10]
-    if len(frames.frame_problems) > 10:
-        found.append(f"{len(frames.frame_problems) - 10} more frames are left out")
-    return found
-
-
 def finished_before(options: ReconstructOptions, frames: FramesFile, digest: str) -> dict[int, FrameWavefront]:
     """What an interrupted run has already done.
 
@@ -172,18 +182,19 @@ def finished_before(options: ReconstructOptions, frames: FramesFile, digest: str
     return before.finished()
 
 
-def run(reconstructor: FramesReconstructor, done: dict[int, FrameWavefront], *, quiet: bool) -> bool:
+def run(
+    work: FramesReconstructor | SequenceRun, frames: FramesFile, done: dict[int, FrameWavefront], *, quiet: bool
+) -> bool:
     """Reconstruct the frames that are not done, in place; returns whether the user interrupted."""
-    frames = reconstructor.frames
     waiting = [n for n in range(len(frames.electrons)) if n not in done and n not in frames.frame_problems]
     if not waiting:
         return False
     try:
         with working("Compiling for this sensor", quiet=quiet):
-            seconds = reconstructor.compile()
+            seconds = work.compile()
         say(f"Compiled for this sensor in {seconds:.1f} s.", quiet=quiet)
-        for number in tracked(waiting, what="Reconstructing", total=len(waiting), quiet=quiet):
-            done[number] = reconstructor.reconstruct(number)
+        for number, found in tracked(work.each(waiting), what="Reconstructing", total=len(waiting), quiet=quiet):
+            done[number] = found
     except KeyboardInterrupt:
         return True
     return False
@@ -193,69 +204,3 @@ def light_lost(reconstructor: FramesReconstructor, done: dict[int, FrameWavefron
     """Share of the light of each plane that misses the window, mean over the first successes."""
     good = [each.opd_m for each in done.values() if is_success(each.outcome)][:10]
     return reconstructor.light_outside(good) if good else None
-
-
-def header_lines(frames: FramesFile, reconstructor: FramesReconstructor, *, already: int) -> list[str]:
-    """What is about to be reconstructed."""
-    count, planes, rows, columns = frames.electrons.shape
-    usable = [number for number in range(count) if number not in frames.frame_problems]
-    electrons = np.median(reconstructor.photo_electrons[usable].sum(axis=(1, 2, 3)))
-    masked = int(frames.masked.sum())
-    seeing = reconstructor.settings.seeing_arcsec
-    prior = "measured from each frame" if seeing is None else f"seeing {seeing:.2g} arcsec (estimation.seeing_arcsec)"
-    return [
-        f"Frames: {count} of {planes} planes of {rows} x {columns} pixels, {frames.diameter_m / frames.pixel_m:.3g} "
-        f"across the pupil; {electrons:.0f} electrons in a frame{f', {masked} pixels masked' if masked else ''}.",
-        f"Strength of the turbulence: {prior}.",
-        *([f"Done before: {already} frames."] if already else []),
-    ]
-
-
-def result_lines(wavefront: WavefrontFile, lost: np.ndarray | None) -> list[str]:
-    """How it went: a line per frame for a few, a summary for many."""
-    lines = []
-    if lost is not None:
-        shares = ", ".join(percent(float(share)) for share in lost)
-        lines.append(f"Light outside the window: about {shares} of planes 1 to {len(lost)}.")
-    numbers = range(len(wavefront.outcomes))
-    failed = [number for number in numbers if not is_success(wavefront.outcomes[number])]
-    several = len(numbers) > FEW_FRAMES
-    for number in failed[:FEW_FRAMES] if several else numbers:
-        lines.append(frame_line(wavefront, number))
-    if several and len(failed) > FEW_FRAMES:
-        lines.append(f"... and {len(failed) - FEW_FRAMES} more that are no success")
-    if len(numbers) > 1:
-        lines += summary_lines(wavefront)
-    return lines
-
-
-def frame_line(wavefront: WavefrontFile, number: int) -> str:
-    """One frame in one line."""
-    name = f"Frame {number}" if wavefront.has_frame_axis else "Wavefront"
-    if not wavefront.ran[number]:
-        sentence = wavefront.sentences[number]
-        return f"{name}: {wavefront.outcomes[number]}{f': {sentence}' if sentence else ''}."
-    error = ""
-    if wavefront.error_nm is not None and np.isfinite(wavefront.error_nm[number]):
-        error = f"error {wavefront.error_nm[number]:.1f} nm rms (against TRUTH), "
-    return (
-        f"{name}: {wavefront.rms_nm[number]:.1f} nm rms, {error}"
-        f"predicted {wavefront.predicted_error_nm[number]:.1f} nm; {wavefront.sentences[number]} "
-        f"({wavefront.iterations[number]} iterations, {wavefront.ffts[number]} FFTs, "
-        f"{1e3 * wavefront.runtime_s[number]:.0f} ms)."
-    )
-
-
-def summary_lines(wavefront: WavefrontFile) -> list[str]:
-    """All frames in a few lines."""
-    counts = Counter(wavefront.outcomes)
-    lines = [f"Outcomes: {', '.join(f'{count} {name}' for name, count in counts.most_common())}."]
-    columns = {"rms": wavefront.rms_nm, "error": wavefront.error_nm, "predicted error": wavefront.predicted_error_nm}
-    for name, values in columns.items():
-        known = np.empty(0) if values is None else values[np.isfinite(values)]
-        if known.size:
-            low, middle, high = np.percentile(known, [10, 50, 90])
-            lines.append(
-                f"{name.capitalize()}: median {middle:.1f} nm, 80 % of frames from {low:.1f} to {high:.1f} nm."
-            )
-    return lines

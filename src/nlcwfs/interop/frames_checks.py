@@ -18,6 +18,10 @@ NEGATIVE_LIMIT = 0.1
 FAINT_SIGMA = 3.0
 """Light of a whole frame, or of a plane that is far too dark, counts when it is this far above its noise."""
 
+PHOTONS_FACTOR = 2
+"""A frame has its expected light within this factor: a window may miss half of it, a transparency be misjudged by as
+much; a wrong gain, unit or exposure is mostly worse."""
+
 FLAT_TOP_PIXELS = 8
 FLAT_TOP_RATIO = 5
 """A frame whose largest value is in 8 pixels or more, and 5 times as often as the next one, looks saturated:
@@ -35,6 +39,7 @@ class PixelRules:
         saturation_electrons: A pixel this bright is full; infinite when unknown.
         flux_fractions: Share of the light of each plane.
         distances_m: For the messages.
+        photons: Photo-electrons that the star is expected to have in a frame, if known.
     """
 
     level_electrons: Float[np.ndarray, "plane y x"]
@@ -43,6 +48,7 @@ class PixelRules:
     saturation_electrons: float
     flux_fractions: Float[np.ndarray, " plane"]
     distances_m: tuple[float, ...]
+    photons: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +93,7 @@ def examine_frame(electrons: Float[np.ndarray, "plane y x"], rules: PixelRules) 
         _lost(counts, int((~rules.ignored).sum()))
         or _dark_or_negative(electrons[~masked], counts["negative_pixels"], light_electrons, noise_electrons)
         or _dead_plane(light_electrons, noise_electrons, rules)
+        or _other_light(light_electrons, noise_electrons, rules)
     )
     return FrameReport(masked=masked, light_electrons=light_electrons, problem=problem, **counts)
 
@@ -163,6 +170,16 @@ def _dead_plane(light: np.ndarray, noise: np.ndarray, rules: PixelRules) -> str 
     where = f"plane {plane + 1} (ZPLANE{plane + 1} = {rules.distances_m[plane]:g} m)"
     share = f"{light[plane]:.3g} of the {promised[plane]:.3g} electrons that are its share"
     return f"{where} must hold light, got {share}"
+
+
+def _other_light(light: np.ndarray, noise: np.ndarray, rules: PixelRules) -> str | None:
+    if rules.photons is None:
+        return None
+    found, doubt = float(light.sum()), FAINT_SIGMA * np.sqrt(np.sum(noise**2) + rules.photons)
+    if rules.photons / PHOTONS_FACTOR - doubt <= found <= rules.photons * PHOTONS_FACTOR + doubt:
+        return None
+    rule = f"must hold the {rules.photons:.4g} photo-electrons of PHOTONS within a factor {PHOTONS_FACTOR}"
+    return f"{rule} (up to half may miss the window), got {found:.4g}"
 
 
 def _uneven(shares: np.ndarray, flux_fractions: np.ndarray) -> list[str]:

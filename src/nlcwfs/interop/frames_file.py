@@ -27,6 +27,8 @@ class FramesFile:
         saturation_electrons: A pixel this bright is full, if known.
         flux_fractions: Share of the light of each plane, sum 1; None for equal shares.
         seeing_arcsec: Seeing at 500 nm.
+        photons: Photo-electrons that the whole sensor is expected to have of the star in an exposure, if known.
+        times_s: When each frame was taken, ascending; None for frames at `rate_hz`, or without an order in time.
         pupil: Amplitude of the pupil, 0 to 1; None for a circle with its obstruction.
         background: Background in electrons, one image for all planes or one per plane.
         bad_pixels: Pixels to ignore, one map for all planes or one per plane.
@@ -67,6 +69,8 @@ class FramesFile:
     exposure_s: float | None = None
     seeing_arcsec: float | None = None
     rate_hz: float | None = None
+    photons: float | None = None
+    times_s: Float[np.ndarray, " frame"] | None = None
     pupil: Float[np.ndarray, "y x"] | None = None
     background: Float[np.ndarray, "..."] | None = None
     bad_pixels: Bool[np.ndarray, "..."] | None = None
@@ -88,6 +92,7 @@ class FramesFile:
             "background": (shape[2:], shape[1:]),
             "bad_pixels": (shape[2:], shape[1:]),
             "truth_m": (shape[2:], (shape[0], *shape[2:])),
+            "times_s": (shape[:1],),
         }
         for name, shapes in allowed.items():
             array = getattr(self, name)

@@ -22,10 +22,10 @@ from nlcwfs.interop.fits_keywords import (
 from nlcwfs.interop.frames_checks import PixelRules, examine_frame, frame_warnings
 from nlcwfs.interop.frames_file import FramesFile
 from nlcwfs.interop.frames_header import check_window, detector_fields, optics_fields, unit_and_gain
-from nlcwfs.interop.frames_maps import background_map, bad_pixel_map, pupil_map, truth_map
+from nlcwfs.interop.frames_maps import background_map, bad_pixel_map, frame_clock, pupil_map, truth_map
 from nlcwfs.interop.provenance import Provenance
 
-MAPS = ("PUPIL", "BACKGROUND", "BADPIX", "TRUTH")
+MAPS = ("PUPIL", "BACKGROUND", "BADPIX", "TRUTH", "TIME")
 
 
 def read_frames(path: str | Path) -> FramesFile:
@@ -118,6 +118,8 @@ def write_frames(
             about = [("BUNIT", units[name], "")] if name in units else []
             header = header_of([*about, *position_cards(data.shape, frames.pixel_m)])
             hdus.append(fits.ImageHDU(data, header, name=name))
+    if frames.times_s is not None:
+        hdus.append(fits.ImageHDU(frames.times_s, header_of([("BUNIT", "s", "")]), name="TIME"))
     write_hdus(path, hdus)
 
 
@@ -157,6 +159,8 @@ def _read_maps(
         )
     if "TRUTH" in parts:
         maps["truth_m"] = truth_map(keywords, parts["TRUTH"], frame_count=frame_count, shape=planes[1:])
+    if "TIME" in parts:
+        maps["times_s"] = frame_clock(keywords, parts["TIME"], frame_count=frame_count)
     unknown = [name for name in parts if name not in ("PRIMARY", *MAPS)]
     return maps, notes + [f"{name}: is not one of {', '.join(MAPS)}, ignored" for name in unknown]
 
@@ -171,6 +175,7 @@ def _pixel_rules(shape: tuple[int, int, int], fields: dict[str, Any], maps: dict
         saturation_electrons=np.inf if saturation is None else saturation,
         flux_fractions=np.full(shape[0], 1 / shape[0]) if shares is None else np.array(shares),
         distances_m=fields["distances_m"],
+        photons=fields["photons"],
     )
 
 
@@ -216,6 +221,7 @@ def _detector_cards(frames: FramesFile, electrons_per_unit: float) -> list[Card]
         ("EXPTIME", frames.exposure_s, "[s] exposure of a frame"),
         ("SEEING", frames.seeing_arcsec, "[arcsec] at 500 nm"),
         ("RATE", frames.rate_hz, "[Hz] frames per second"),
+        ("PHOTONS", frames.photons, "[electron] expected in an exposure"),
     ]
     return [
         ("RDNOISE", frames.read_noise_electrons, "[electron] rms read noise"),

@@ -81,6 +81,7 @@ def detector_fields(keywords: Keywords) -> dict[str, Any]:
         "dark_electrons": keywords.optional_number("DARK", rule, _not_negative) or 0.0,
         "saturation_electrons": saturation,
         "exposure_s": keywords.optional_number("EXPTIME", "must be a positive number of seconds", _positive),
+        "photons": keywords.optional_number("PHOTONS", "must be a positive number of photo-electrons", _positive),
         "rate_hz": keywords.optional_number("RATE", "must be a positive number of hertz", _positive),
     }
 

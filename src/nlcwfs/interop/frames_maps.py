@@ -1,4 +1,4 @@
-"""The optional images of a frames file: PUPIL, BACKGROUND, BADPIX and TRUTH, and the rules they must keep."""
+"""The optional HDUs of a frames file: PUPIL, BACKGROUND, BADPIX, TRUTH and TIME, and the rules they must keep."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -87,6 +87,31 @@ def truth_map(keywords: Keywords, part: Hdu, *, frame_count: int, shape: tuple[i
     if largest_m > OPD_LIMIT_M:
         raise keywords.error("TRUTH", f"must be in metres, within {OPD_LIMIT_M:g}", f"{largest_m:g}")
     return truth_m
+
+
+def frame_clock(keywords: Keywords, part: Hdu, *, frame_count: int) -> Float[np.ndarray, " frame"]:
+    """When each frame was taken, in seconds.
+
+    Raises:
+        FileFormatError: If it is not one number per frame, not in seconds, not finite, or not ascending.
+    """
+    unit = part.header.get("BUNIT", "s")
+    if str(unit).strip() != "s":
+        raise keywords.error("TIME", "must have BUNIT 's'", repr(unit))
+    rule = f"must hold the seconds of every frame, {frame_count}"
+    if not isinstance(part.data, np.ndarray) or part.data.dtype.names is not None:
+        raise keywords.error("TIME", rule, "no array of numbers")
+    if part.data.shape != (frame_count,):
+        raise keywords.error("TIME", rule, _by(part.data.shape))
+    times_s = np.array(part.data, dtype=np.float64)
+    if not np.all(np.isfinite(times_s)):
+        number = int(np.argmin(np.isfinite(times_s)))
+        raise keywords.error("TIME", "must be finite", f"{times_s[number]} for frame {number}")
+    early = np.flatnonzero(np.diff(times_s) <= 0)
+    if early.size:
+        later, before = times_s[early[0] + 1], times_s[early[0]]
+        raise keywords.error("TIME", "must ascend", f"{later:.10g} s for frame {early[0] + 1} after {before:.10g} s")
+    return times_s
 
 
 def _image(keywords: Keywords, name: str, part: Hdu, shapes: _Shapes) -> Float[np.ndarray, "..."]:

@@ -41,6 +41,16 @@ def sensor_geometry(frames: FramesFile) -> SensorGeometry:
     )
 
 
+def window_pupil(geometry: SensorGeometry, shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:
+    """Amplitude of the pupil on a window that holds it whole, with the pixels and the centre of the frames.
+
+    Examples:
+        >>> window_pupil(SensorGeometry(PupilShape(8.0), Grid((4, 6), 1.0), 0.65e-6, (3e6,)), (10, 12)).shape
+        (10, 12)
+    """
+    return geometry.pupil.on(Grid(shape, geometry.frame.pixel_m))
+
+
 def pupil_on_frame(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
     """Amplitude of the pupil on the pixels of a frame, which may be narrower than the pupil.
 
@@ -50,7 +60,7 @@ def pupil_on_frame(geometry: SensorGeometry) -> Float[np.ndarray, "y x"]:
     """
     rows, columns = geometry.frame.shape
     margin = math.ceil(geometry.pupil.diameter_m / geometry.frame.pixel_m / 2)
-    pupil = geometry.pupil.on(Grid((rows + 2 * margin, columns + 2 * margin), geometry.frame.pixel_m))
+    pupil = window_pupil(geometry, (rows + 2 * margin, columns + 2 * margin))
     return pupil[margin : margin + rows, margin : margin + columns]
 
 

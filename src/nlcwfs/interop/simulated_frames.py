@@ -103,6 +103,7 @@ def frames_of(
         saturation_electrons=_saturation(detector),
         exposure_s=None if rate_hz is None else 1 / rate_hz,
         rate_hz=rate_hz,
+        photons=camera.quantum_efficiency * config.atmosphere.photons,
         flux_fractions=config.curvature_sensor.flux_fractions,
         seeing_arcsec=seeing_arcsec(simulator.air),
         pupil=simulator.shape.on(grid),

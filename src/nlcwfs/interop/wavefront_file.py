@@ -32,6 +32,8 @@ class FrameWavefront:
         coefficient_m: The wavefront's modes; none when the method has no modes.
         sigma_m: Their 1-sigma errors.
         error_nm: rms of (found - true), piston removed; None when the truth is not known.
+        quantum_limit_nm: Error that no sensor could beat with this light; None when the method tells none.
+        photon_loss: Photons that the sensor needs relative to that limit; None when the method tells none.
         residual: Data - model in electrons.
         sentence: What the outcome means here.
     """
@@ -46,6 +48,8 @@ class FrameWavefront:
     coefficient_m: Float[np.ndarray, " mode"]
     sigma_m: Float[np.ndarray, " mode"]
     error_nm: float | None = None
+    quantum_limit_nm: float | None = None
+    photon_loss: float | None = None
     residual: Float[np.ndarray, "plane y x"] | None = None
     sentence: str = ""
 
@@ -84,6 +88,8 @@ class WavefrontFile:
     coefficient_m: Float[np.ndarray, "frame mode"]
     sigma_m: Float[np.ndarray, "frame mode"]
     error_nm: Float[np.ndarray, " frame"] | None = None
+    quantum_limit_nm: Float[np.ndarray, " frame"] | None = None
+    photon_loss: Float[np.ndarray, " frame"] | None = None
     residual: Float[np.ndarray, "frame plane y x"] | None = None
     source: str = ""
     source_digest: str = ""
@@ -132,7 +138,11 @@ class WavefrontFile:
         outcomes = gaps | {number: frame.outcome for number, frame in done.items()}
         sentences = {n: problems.get(n, "") for n in gaps} | {n: frame.sentence for n, frame in done.items()}
         no_modes, no_residual = np.full(len(modes), np.nan), np.full(shape[1:], np.nan)
-        scored = frames.truth_m is not None or any(frame.error_nm is not None for frame in done.values())
+
+        def known(name: str) -> Any:
+            told = any(getattr(frame, name) is not None for frame in done.values())
+            return column(name, np.nan) if told else None
+
         explained = any(frame.residual is not None for frame in done.values())
         return cls(
             opd_m=column("opd_m", np.full(shape[2:], np.nan)),
@@ -151,7 +161,9 @@ class WavefrontFile:
             noll=modes,
             coefficient_m=column("coefficient_m", no_modes),
             sigma_m=column("sigma_m", no_modes),
-            error_nm=column("error_nm", np.nan) if scored else None,
+            error_nm=column("error_nm", np.nan) if frames.truth_m is not None else known("error_nm"),
+            quantum_limit_nm=known("quantum_limit_nm"),
+            photon_loss=known("photon_loss"),
             residual=column("residual", no_residual) if explained else None,
             source=frames.source,
             source_digest=frames.source_digest,
@@ -167,7 +179,9 @@ class WavefrontFile:
         return {int(number): self._frame(int(number)) for number in np.flatnonzero(self.ran)}
 
     def _frame(self, number: int) -> FrameWavefront:
-        error_nm = np.nan if self.error_nm is None else float(self.error_nm[number])
+        def told(values: Float[np.ndarray, " frame"] | None) -> float | None:
+            return None if values is None or np.isnan(values[number]) else float(values[number])
+
         return FrameWavefront(
             opd_m=self.opd_m[number],
             rms_nm=float(self.rms_nm[number]),
@@ -178,7 +192,9 @@ class WavefrontFile:
             runtime_s=float(self.runtime_s[number]),
             coefficient_m=self.coefficient_m[number],
             sigma_m=self.sigma_m[number],
-            error_nm=None if np.isnan(error_nm) else error_nm,
+            error_nm=told(self.error_nm),
+            quantum_limit_nm=told(self.quantum_limit_nm),
+            photon_loss=told(self.photon_loss),
             residual=None if self.residual is None else self.residual[number],
             sentence=self.sentences[number],
         )

@@ -18,8 +18,13 @@ _NUMBERS = {
     "PREDERR": ("predicted_error_nm", "[nm] predicted 1-sigma error"),
     "RUNTIME": ("runtime_s", "[s] computing time"),
     "ERR_NM": ("error_nm", "[nm] rms of error, no piston"),
+    "QLIMIT": ("quantum_limit_nm", "[nm] error at the quantum limit"),
+    "PHOTLOSS": ("photon_loss", "photons needed over those at QLIMIT"),
 }
 """Keyword, field of the record and comment; with several frames the field is a column of FRAMES instead."""
+
+_OPTIONAL = ("ERR_NM", "QLIMIT", "PHOTLOSS")
+"""Left out where they are not known."""
 
 
 def write_wavefront(path: str | Path, wavefront: WavefrontFile, provenance: Provenance) -> None:
@@ -178,14 +183,14 @@ def _columns_of_header(keywords: Keywords) -> dict[str, Any]:
         value = keywords.optional_number(key, "must be a number", lambda value: True)
         if name in ("iterations", "ffts"):
             fields[name] = np.array([0 if value is None else int(value)])
-        elif key != "ERR_NM" or key in keywords.header:
+        elif key not in _OPTIONAL or key in keywords.header:
             fields[name] = np.array([np.nan if value is None else value])
     return fields
 
 
 def _columns(keywords: Keywords, parts: dict[str, Hdu], frame_count: int) -> dict[str, Any]:
     """The fields of several frames, from the table FRAMES."""
-    needed = ("outcome", "sentence", *[name for name, _ in _NUMBERS.values() if name != "error_nm"])
+    needed = ("outcome", "sentence", *[name for key, (name, _) in _NUMBERS.items() if key not in _OPTIONAL])
     table = _table(keywords, parts, "FRAMES", needed, frame_count)
     fields: dict[str, Any] = {
         f"{name}s": tuple(str(text).strip() for text in table[name]) for name in ("outcome", "sentence")
