@@ -54,6 +54,16 @@ BAD_FRAMES = {
     "infinite": (lambda path: written(path, with_pixels(np.inf, rows=9)), "got 25.0 % NaN or infinite"),
     "negative": (lambda path: written(path, light() - 50), "must not be negative"),
     "dead plane": (lambda path: written(path, dead_plane()), "plane 2 (ZPLANE2 = 3.5e+06 m) must hold light"),
+    "plane ignored": (
+        lambda path: written(path, None, ("BADPIX", np.stack([np.ones((36, 36)), np.zeros((36, 36))]))),
+        "BADPIX: must leave pixels in every plane",
+    ),
+    "photons": (
+        lambda path: written(path, PHOTONS=5e4),
+        "must hold the 50000 photo-electrons of PHOTONS within a factor 2 (up to half may miss the window), got 23",
+    ),
+    "too many photons": (lambda path: written(path, PHOTONS=1e4), "10000 photo-electrons of PHOTONS within a factor 2"),
+    "no photons": (lambda path: written(path, PHOTONS=0.0), "PHOTONS: must be a positive number of photo-electrons"),
     "saturated": (lambda path: written(path, SATURATE=8.0), "saturated (SATURATE)"),
     "all zero": (lambda path: written(path, 0 * light()), "must hold light, got zero everywhere"),
     "pupil of another shape": (
@@ -97,7 +107,20 @@ OPTIONS = {
         'estimation.modes: must be a whole number from 1 to 20000, got "many"',
     ),
     "no equals sign": (("--set", "estimation.modes"), "--set: must be section.key=value"),
-    "method": (("--method", "magic"), "--method: must be map or gerchberg-saxton or linear, got magic"),
+    "method": (("--method", "magic"), "--method: must be map, gerchberg-saxton or linear, got magic"),
+    "no Fried parameter": (
+        ("--set", "estimation.prior.fried_m=-0.1"),
+        "estimation.prior.fried_m: must be a number greater than 0 [m], got -0.1",
+    ),
+    "no seeing": (
+        ("--set", "estimation.seeing_arcsec=0"),
+        "estimation.seeing_arcsec: must be a number greater than 0 and at most 10 [arcsec], got 0",
+    ),
+    "outer scale": (
+        ("--set", "estimation.prior.outer_scale_m=2"),
+        "estimation.prior.outer_scale_m: must be at least the telescope's diameter (8 m), got 2",
+    ),
+    "one frame as a sequence": (("--sequence",), "frames.fits: PRIMARY: must hold at least 2 frames for --sequence"),
     "no folder": (("--out", "nowhere/w.fits"), "nowhere/w.fits: output folder must exist"),
     "the frames themselves": (("--out", "frames.fits"), "--out: must not overwrite the frames, got frames.fits"),
     "kind of picture": (("--plot", "p.gif"), "--plot: must end in .png, .pdf, .svg, .jpg, got p.gif"),

@@ -135,7 +135,7 @@ def read_estimation(path: Path | None, overrides: Sequence[str], method: str | N
         NlcwfsError: If the file cannot be read, or a setting breaks its rule or belongs to the frames.
     """
     if method is not None and method not in METHODS:
-        raise SettingsError("--method", f"must be {' or '.join(METHODS)}", method)
+        raise SettingsError("--method", f"must be {', '.join(METHODS[:-1])} or {METHODS[-1]}", method)
     for text in overrides:
         key = text.partition("=")[0].strip()
         if "=" in text and key.partition(".")[0] not in OWN_KEYS:

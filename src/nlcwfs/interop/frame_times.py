@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from nlcwfs.interop.fits_keywords import file_error
 from nlcwfs.interop.frames_file import FramesFile
@@ -71,19 +70,13 @@ def frame_times(frames: FramesFile, path: str | Path) -> FrameTimes:
     steps = np.maximum(np.round(apart_s / told_s), 1)
     interval_s = float(np.sum(apart_s) / np.sum(steps))  # a rate that is rounded must not add up over long gaps
     if abs(interval_s / told_s - 1) > IRREGULAR:
-        rule = f"must be whole multiples of {_clock(frames)} apart within 1 %"
-        raise file_error(path, "TIME", rule, f"{interval_s:.5g} s on average")
-    _check_regular(frames, path, apart_s / interval_s - steps, apart_s)
-    return FrameTimes(interval_s, (0, *(int(step) for step in np.cumsum(steps))))
-
-
-def _check_regular(
-    frames: FramesFile, path: str | Path, late: Float[np.ndarray, " gap"], apart_s: Float[np.ndarray, " gap"]
-) -> None:
+        interval_s = told_s
+    late = apart_s / interval_s - steps
     worst = int(np.argmax(np.abs(late)))
     if abs(late[worst]) > IRREGULAR:
-        rule = f"must be whole multiples of {_clock(frames)} apart within 1 % of it"
+        rule = f"must be whole multiples of {_clock(frames)} apart, within 1 % of it"
         raise file_error(path, "TIME", rule, f"{apart_s[worst]:.5g} s between frames {worst} and {worst + 1}")
+    return FrameTimes(interval_s, (0, *(int(step) for step in np.cumsum(steps))))
 
 
 def _clock(frames: FramesFile) -> str:

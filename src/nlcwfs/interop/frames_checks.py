@@ -178,8 +178,8 @@ def _other_light(light: np.ndarray, noise: np.ndarray, rules: PixelRules) -> str
     found, doubt = float(light.sum()), FAINT_SIGMA * np.sqrt(np.sum(noise**2) + rules.photons)
     if rules.photons / PHOTONS_FACTOR - doubt <= found <= rules.photons * PHOTONS_FACTOR + doubt:
         return None
-    rule = f"must hold the {rules.photons:.4g} photo-electrons of PHOTONS within a factor {PHOTONS_FACTOR}"
-    return f"{rule} (up to half may miss the window), got {found:.4g}"
+    rule = f"must hold the {rules.photons:.0f} photo-electrons of PHOTONS within a factor {PHOTONS_FACTOR}"
+    return f"{rule} (up to half may miss the window), got {found:.0f}"
 
 
 def _uneven(shares: np.ndarray, flux_fractions: np.ndarray) -> list[str]:
