@@ -28,6 +28,11 @@ from nlcwfs.estimation.turbulence_filter import rms_of_power
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown
 
+TRUST = 0.9
+"""Share of the prediction in what is expected; the rest is air that has never been seen. Air comes in over the rim of
+the pupil, which a filter that is diagonal in Fourier space cannot know: without it a loop that knows its wind ends at
+143 nm, with it at 72 (`bench/closed_loop.py`)."""
+
 
 class Memory(eqx.Module):
     """What is known when a frame has been seen.
@@ -194,6 +199,7 @@ class SequenceReconstructor(eqx.Module):
         solver = self.solver
         power = solver.power * memory.strength
         mean_rad, left_open = predicted_mean_and_power(memory.phase_rad, memory.left_open, power, self.correlation)
+        left_open = TRUST * left_open + (1 - TRUST) * power
         again = self.tilt_correlation**2
         tilt = solver.tilt_rms_rad**2 * memory.strength
         tilt_left_rad = jnp.sqrt(again * memory.tilt_left_rad**2 + (1 - again) * tilt)
