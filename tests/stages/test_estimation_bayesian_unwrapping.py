@@ -91,10 +91,10 @@ def test_noise_passes_and_takes_no_turn_with_it(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_pixels_that_lie_cost_nothing_but_themselves(seed):
-    """One in thirty holds any phase at all. Least squares without doubt would bend the others."""
+    """One in five holds any phase at all. Least squares without doubt takes up to a fifth of the others along."""
     rng = np.random.default_rng(200 + seed)
     truth_rad = turbulence(seed, fried=6.0)
-    lies = rng.uniform(size=SHAPE) < 1 / 30
+    lies = rng.uniform(size=SHAPE) < 1 / 5
     given_rad = np.where(lies, rng.uniform(-np.pi, np.pi, SHAPE), wrapped(truth_rad))
     found = compiled(6.0)(jnp.asarray(given_rad))
     np.testing.assert_allclose(turns_off(found, truth_rad, LIT & ~lies), 0, atol=EXACT)
