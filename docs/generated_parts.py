@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from nlcwfs.cli import app
 from nlcwfs.config import default_toml
 
-STUDIES = ("01-single-frame",)
+STUDIES = ("01-single-frame", "02-every-method")
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 
 
