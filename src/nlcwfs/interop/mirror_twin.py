@@ -4,7 +4,7 @@ Light on a plane at distance z from the pupil is, but for its scale and a curved
 :math:`A \exp(i \phi + i \pi |x|^2 / (\lambda z))` (Goodman 2005, eq. 4-17). A function and its mirrored conjugate,
 :math:`g(x)` and :math:`g^*(-x)`, have Fourier transforms of the same modulus. So in a pupil that is the same when it is
 turned by half a turn, :math:`\phi(x)` and :math:`-\phi(-x) - 2 \pi |x|^2 / (\lambda z)` make the same image. In metres
-of path: W(x) and -W(-x) - |x|^2 / z. A second plane, at another distance, tells them apart.
+of path: :math:`W(x)` and :math:`-W(-x) - |x|^2 / z`. A second plane, at another distance, tells them apart.
 """
 
 import math
