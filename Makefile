@@ -41,6 +41,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 
 bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs
 	$(BIN)/python bench/gerchberg_saxton.py
+	$(BIN)/python bench/maximum_a_posteriori.py
 
 clean:  ## Back to a fresh clone, but for changes of yours
 	rm -rf $(VENV) docs/_build docs/_generated demo dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
