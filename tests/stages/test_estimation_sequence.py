@@ -130,7 +130,7 @@ def followed(stream) -> list:
 def test_followed_frames_are_as_good_as_each_alone_and_better_than_the_last_one(stream, followed):
     cold = stream.errors_nm([estimate for estimate, _ in stream.alone])
     warm = stream.errors_nm(followed, first=1)
-    assert 10 < np.median(cold) < 40
+    assert 10 < np.median(cold) < 18  # measured 13.8
     assert np.all(warm < 1.1 * np.median(cold))
     stale = np.array([error_nm(stream.alone[0][0].opd_m, truth_rad(n)) for n in range(1, FRAMES)])
     assert np.all(warm[2:] < stale[2:])  # the air of the first frame is gone
@@ -140,7 +140,7 @@ def test_followed_frames_are_as_good_as_each_alone_and_better_than_the_last_one(
 def test_the_error_told_of_a_followed_frame_is_near_the_error(stream, followed):
     told = 1e9 * np.array([float(one.predicted_error_m) for one in followed])
     ratio = stream.errors_nm(followed, first=1) / told
-    assert np.all((ratio > 0.5) & (ratio < 1.3))
+    assert np.all((ratio > 0.6) & (ratio < 1.1))  # measured 0.73 to 0.83: turbulence within a pixel is counted as error
 
 
 def test_a_missing_frame_does_not_lose_the_air(stream):
@@ -186,7 +186,7 @@ def test_light_of_other_air_is_not_believed(stream):
 
 
 def cells_in(jaxpr) -> float:
-    """Cells that the FFTs of a program turn, those of loops as often as they run; a real FFT counts half."""
+    """Cells that the FFTs of a program go through, those of loops as often as they run; a real FFT counts half."""
     total = 0.0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "fft":
@@ -204,15 +204,15 @@ def cells_in(jaxpr) -> float:
 
 
 @pytest.mark.parametrize("budget", [60, 100, 150])
-def test_a_followed_frame_keeps_to_its_budget_and_uses_it(budget, stream):
+def test_a_followed_frame_keeps_to_its_budget_and_uses_it(budget):
+    """Two cells of the model a pixel, as by default: FFTs of images are a quarter of one of the model."""
     sequence = sensor(ffts_per_frame=budget, oversampling=2)
     memory = jax.eval_shape(lambda: sequence.start(jnp.ones((4, *FRAME)), USABLE)[1])
-    program = jax.make_jaxpr(lambda counts, memory: sequence.follow(counts, USABLE, memory)[0].opd_m)(
+    program = jax.make_jaxpr(lambda counts, memory: sequence.follow(counts, USABLE, memory))(
         jnp.ones((4, *FRAME)), memory
     )
     ffts = cells_in(program.jaxpr) / np.prod(sequence.solver.level.grid.shape)
-    assert ffts <= sequence.ffts <= budget
-    assert sequence.ffts - ffts <= 4 + 1  # the program may not need what the count of images adds
+    assert ffts == sequence.ffts <= budget
     more = fixed_ffts(4, inner=sequence.inner + 1, steps=MAP.sequence_steps)
     assert more > budget  # not one conjugate gradient more would fit
 
