@@ -20,7 +20,7 @@ def write_pages(docs: Path) -> None:
     for name in STUDIES:
         folder = docs.parent / "studies" / name
         readme = folder / "README.md"
-        text = _lowered(readme.read_text()) if readme.exists() else PENDING
+        text = _lowered(readme.read_text(encoding="utf-8")) if readme.exists() else PENDING
         for picture in sorted(folder.glob("*.png")):
             kept = f"study-{name}-{picture.name}"
             _write(docs / "_generated" / kept, picture.read_bytes())

@@ -34,9 +34,9 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
     "nlcwfs.studies.study_cases:read_study": "needs a folder; `nlcwfs study` shows it",
-    "nlcwfs.studies.study_run:build_solver": "needs a study",
-    "nlcwfs.studies.study_run:make_light": "needs a study",
-    "nlcwfs.studies.study_run:run_case": "needs a study",
+    "nlcwfs.studies.case_run:build_solver": "needs a study",
+    "nlcwfs.studies.case_run:run_case": "needs a study",
+    "nlcwfs.studies.study_light:make_light": "needs a study",
     "nlcwfs.studies.study_run:run_study": "needs a folder, and minutes",
 }
 

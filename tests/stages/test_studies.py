@@ -12,23 +12,29 @@ from tests.stages.command_line import type_in
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.config import load_config
-from nlcwfs.errors import FileFormatError, SettingsError
+from nlcwfs.errors import FileFormatError
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import GerchbergSaxton
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
-from nlcwfs.studies import study_figures, study_run
+from nlcwfs.studies import case_run, study_run
+from nlcwfs.studies.accelerator_figures import draw_convergence, draw_light_and_turbulence, family
 from nlcwfs.studies.case_bound import LightInformation
-from nlcwfs.studies.study_cases import Case, read_study
-from nlcwfs.studies.study_figures import draw_figures, family
+from nlcwfs.studies.study_cases import Capture, Case, read_study
+from nlcwfs.studies.study_figures import draw_figures
+from nlcwfs.studies.study_light import Light, Screen
 from nlcwfs.studies.study_report import write_report
-from nlcwfs.studies.study_run import Light, Screen, run_study
+from nlcwfs.studies.study_run import BOUND_COLUMNS, run_study
 from nlcwfs.studies.study_table import StudyTable
 
 CAMERA = ["beam.wavelength_um=0.65", "detector.pixels_across_pupil=12", "detector.window_pixels=16"]
 SKY = ["atmosphere.opd_rms_nm=100", "atmosphere.photons=1e5", "simulation.light_oversampling=2"]
+GERCHBERG_SAXTON = "estimation.method=gerchberg-saxton"
 FEW = ["coarse_cutoffs_cpa=[]", "iterations=12", "fast_forward=0", "gain=1", "tolerance_rad=0"]
-PLAIN = [f"estimation.gerchberg_saxton.{one}" for one in (*FEW, "filter=none", "scheme=serial", "amplitude=replace")]
+PLAIN = [
+    GERCHBERG_SAXTON,
+    *(f"estimation.gerchberg_saxton.{one}" for one in (*FEW, "filter=none", "scheme=serial", "amplitude=replace")),
+]
 SLOPES = ["estimation.unwrapping=slopes", "estimation.modes=20"]
 
 SHORT = """question = "Does it run?"
@@ -120,8 +126,10 @@ def test_a_study_that_is_not_there_or_not_text_is_told_in_one_line(tmp_path):
 def test_an_impossible_setting_is_told_before_anything_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(study_run, "make_light", None)
     written(tmp_path, SHORT.replace('"atmosphere.photons=1e6"', '"atmosphere.photon=1e6"'))
-    with pytest.raises(SettingsError, match=r"^atmosphere\.photon: [^\n]*$"):
+    with pytest.raises(FileFormatError) as caught:
         run_study(tmp_path, progress=silent)
+    assert str(caught.value).startswith(f"{tmp_path / 'study.toml'}: case a-bright: atmosphere.photon: ")
+    assert "\n" not in str(caught.value)
     assert not (tmp_path / "results.ecsv").exists()
 
 
@@ -165,10 +173,10 @@ def real(tmp_path_factory):
         errors_m.append(score(*arguments))
         return errors_m[-1]
 
-    make_light, score = study_run.make_light, study_run.wavefront_error_m
+    make_light, score = study_run.make_light, case_run.wavefront_error_m
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study_run, "make_light", light)
-        patch.setattr(study_run, "wavefront_error_m", error_m)
+        patch.setattr(case_run, "wavefront_error_m", error_m)
         table = run_study(folder, progress=lambda *call: progress.append(call))
     return folder, table, lights, 1e9 * np.array(errors_m), progress
 
@@ -288,15 +296,17 @@ def screen(error_nm: float, outcome: Outcome, *, predicted_nm=0.0, iterations=0,
     counts = np.zeros((4, 16, 16))
     counts[0] = 1e-9 * error_nm * np.where(np.arange(16) < 8, 1.0, -1.0)
     counts[1].flat[:5] = outcome, 1e-9 * predicted_nm, iterations, ffts, strength
-    return Screen(np.zeros((16, 16)), counts)
+    return Screen(np.zeros((16, 16)), counts, np.zeros((16, 16)))
 
 
 def summed_up(monkeypatch, screens: list[Screen], *options: str, **case) -> tuple[dict, list]:
     seen = []
     pretended(monkeypatch, seen)
-    light = Light(screens, Grid((16, 16), 8.0 / 12), np.full((16, 16), 1 / 256))
+    even = np.full((16, 16), 1 / 256)
+    light = Light(screens, Grid((16, 16), 8.0 / 12), even, even)
     one = Case(name="a", group="g", **case)
-    return study_run.run_case(one, small(*options), 60.0, light, silent), seen
+    config = small(GERCHBERG_SAXTON, *options)
+    return case_run.run_case(one, config, Capture(60.0), light, silent), seen
 
 
 def test_outcomes_and_medians_are_counted_as_they_are(monkeypatch):
@@ -353,10 +363,10 @@ def test_the_sky_of_a_case_is_in_its_row(monkeypatch):
     assert row["strength_ratio"] == pytest.approx(2 * (0.6 / seeing_arcsec) ** (5 / 3), rel=3e-3)
     row, _ = summed_up(monkeypatch, [twice], strength="known")
     assert row["strength_ratio"] == 2.0
-    solver, _ = study_run.build_solver(Case(name="a", group="g", strength="known"), small())
+    solver, _ = case_run.build_solver(Case(name="a", group="g", strength="known"), small(GERCHBERG_SAXTON))
     assert not solver.measures_strength
     assert solver.settings.seeing_arcsec == pytest.approx(seeing_arcsec, rel=2e-3)
-    assert study_run.build_solver(Case(name="a", group="g"), small())[0].measures_strength
+    assert case_run.build_solver(Case(name="a", group="g"), small(GERCHBERG_SAXTON))[0].measures_strength
 
 
 # ------------------------------------------------------------------------------------------------- resuming
@@ -380,9 +390,9 @@ class Bench:
 
     def make_light(self, case, config, count, progress):
         self.lights.append((case.name, count))
-        return Light([], Grid((2, 2), 1.0), np.ones((2, 2)))
+        return Light([], Grid((2, 2), 1.0), np.ones((2, 2)), np.ones((2, 2)))
 
-    def run_case(self, case, config, captured_nm, light, progress):
+    def run_case(self, case, config, capture, light, progress):
         if case.name == self.interrupt_at:
             raise KeyboardInterrupt
         self.cases.append(case.name)
@@ -411,6 +421,9 @@ def test_cases_of_the_same_light_share_it(tmp_path, bench):
     more = SHORT.replace('strength = "known"', 'strength = "known"\nscreens = 4')
     bench.ran(written(tmp_path / "more", more))
     assert bench.lights == [("a-default", 3), ("b-known", 4), ("a-bright", 2)]
+    fewer = SHORT.replace('strength = "known"', 'strength = "known"\nscreens = 2')
+    bench.ran(written(tmp_path / "fewer", fewer))
+    assert bench.lights == [("a-default", 3), ("a-bright", 2)]  # the first two of the three
     matched = SHORT.replace('strength = "known"', 'light = "matched"')
     bench.ran(written(tmp_path / "matched", matched))
     assert bench.lights == [("a-default", 3), ("b-known", 3), ("a-bright", 2)]
@@ -449,17 +462,26 @@ def test_what_changes_runs_again_and_nothing_else(tmp_path, bench, old, new, aga
     assert stored_cases(tmp_path) == names  # in the order of the study, without what is gone
 
 
-def test_only_some_cases_and_a_quick_look(tmp_path, bench):
+def test_only_some_cases_run(tmp_path, bench):
     written(tmp_path)
     assert bench.ran(tmp_path, only=("a-b", "b")) == ["b-known", "a-bright"]
-    assert bench.ran(tmp_path, only=("a",)) == ["a-default"]
-    assert bench.ran(tmp_path, screens=3) == ["a-bright"]  # the others had three anyway
-    assert bench.ran(tmp_path) == ["a-bright"]  # a quick look does not pass as the study's
+    assert bench.ran(tmp_path) == ["a-default"]
     assert stored_cases(tmp_path) == ["a-default", "b-known", "a-bright"]
 
 
+def test_a_quick_look_leaves_the_rows_of_the_study_alone(tmp_path, bench):
+    bench.ran(written(tmp_path))
+    before = (tmp_path / "results.ecsv").read_bytes()
+    assert bench.ran(tmp_path, screens=3) == ["a-default", "b-known", "a-bright"]
+    assert bench.ran(tmp_path, screens=3) == []  # it resumes, too
+    assert bench.ran(tmp_path, screens=2, only=("a-d",)) == ["a-default"]
+    assert (tmp_path / "results.ecsv").read_bytes() == before
+    assert bench.ran(tmp_path) == []
+    assert len(StudyTable(tmp_path / "quick.ecsv").rows) == 3
+
+
 def test_cases_that_differ_in_photons_alone_share_the_information(tmp_path, bench, monkeypatch):
-    asked, nothing = [], LightInformation([], None)
+    asked, nothing = [], LightInformation([], None, np.zeros((0, 0)), 0.1)
     monkeypatch.setattr(study_run, "light_information", lambda config: asked.append(config) or nothing)
     monkeypatch.setattr(study_run, "case_bound", lambda config, light: BOUND | {"bound_nm": config.atmosphere.photons})
     bench.ran(written(tmp_path, SHORT.replace('group = "few"', 'group = "few"\nbound = true')))
@@ -471,7 +493,7 @@ def test_cases_that_differ_in_photons_alone_share_the_information(tmp_path, benc
     bench.ran(written(tmp_path / "none"))
     assert len(asked) == 3
     rows = StudyTable(tmp_path / "none" / "results.ecsv").rows
-    assert np.isnan([row[name] for row in rows for name in BOUND]).all()
+    assert np.isnan([row[name] for row in rows for name in BOUND_COLUMNS]).all()
 
 
 def stamp(folder) -> dict:
@@ -567,8 +589,8 @@ def convergence_rows() -> list[dict]:
     ]
 
 
-def test_the_curves_of_convergence_are_the_rows_in_the_order_of_their_cost(tmp_path):
-    figure = study_figures._convergence(table_of(tmp_path, convergence_rows()))
+def test_the_curves_of_convergence_are_the_rows_in_the_order_of_their_cost():
+    figure = draw_convergence(convergence_rows())
     left, right = figure.axes
     curves = {line.get_label(): line for line in left.lines}
     assert set(curves) == {"plain, from flat", "default: coarse to fine, filtered"}
@@ -581,7 +603,7 @@ def test_the_curves_of_convergence_are_the_rows_in_the_order_of_their_cost(tmp_p
     assert {text.get_text() for text in right.texts} == {"photon bound"}
 
 
-def test_the_points_against_photons_and_rms_carry_their_bars_and_bounds(tmp_path):
+def test_the_points_against_photons_and_rms_carry_their_bars_and_bounds():
     rows = [
         row("photons-2e3-45px", "photons", photons=2e3, median_nm=50.0, p5_nm=45.0, p95_nm=57.0, **BOUND),
         row("photons-2e4-45px", "photons", photons=2e4),
@@ -589,7 +611,7 @@ def test_the_points_against_photons_and_rms_carry_their_bars_and_bounds(tmp_path
         row("rms-100", "rms", median_nm=12.0, p5_nm=11.0, p95_nm=14.0),
         row("rms-100-plain", "rms", median_nm=15.0, p5_nm=11.0, p95_nm=19.0),
     ]
-    left, right = study_figures._light_and_turbulence(table_of(tmp_path, rows)).axes
+    left, right = draw_light_and_turbulence(rows).axes
     points = {bars.get_label(): bars for bars in left.containers}
     assert set(points) == {"default, 45 pixels", "plain GS, 45 pixels"}
     line, _, (bars,) = points["default, 45 pixels"]
@@ -604,11 +626,13 @@ def test_the_points_against_photons_and_rms_carry_their_bars_and_bounds(tmp_path
 
 
 def test_figures_are_drawn_when_their_rows_are_there(tmp_path):
-    assert draw_figures(tmp_path, table_of(tmp_path, [row("a", "few")])) == {}
-    captions = draw_figures(tmp_path, table_of(tmp_path, convergence_rows()))
+    study = read_study(written(tmp_path, 'figures = ["convergence", "photons-and-turbulence"]\n' + SHORT))
+    assert draw_figures(tmp_path, study, table_of(tmp_path, [row("a", "few")])) == {}
+    captions = draw_figures(tmp_path, study, table_of(tmp_path, convergence_rows()))
     assert list(captions) == ["convergence.png"]
     assert (tmp_path / "convergence.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["convergence.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.png", "study.toml"]
+    assert draw_figures(tmp_path, read_study(written(tmp_path)), table_of(tmp_path, convergence_rows())) == {}
 
 
 # ----------------------------------------------------------------------------------------------- the command
@@ -646,6 +670,6 @@ def test_the_command_ends_with_2_and_one_line_when_the_user_can_mend(tmp_path):
     assert result.stdout == ""
     result = type_in("study", written(tmp_path, SHORT.replace("seed=5", "seed=-5")))
     assert result.exit_code == 2
-    assert result.stderr.startswith("nlcwfs: seed: ")
+    assert result.stderr.startswith(f"nlcwfs: {tmp_path / 'study.toml'}: set: seed: ")
     assert len(result.stderr.splitlines()) == 1
     assert type_in("study", tmp_path, "--screens", "0").exit_code == 2

@@ -67,7 +67,7 @@ def light_information(config: Config) -> LightInformation:
 def products_on_pixels(basis: ModalBasis, *, factor: int, window: tuple[int, int]) -> Float[np.ndarray, "mode mode"]:
     """Mean products of modes that are averaged over detector pixels, see `LightInformation.on_pixels`."""
     weights = jnp.asarray(basis.weights, jnp.float32)
-    weighted = integrate_on_pixels(jnp.asarray(basis.modes, jnp.float32) * weights, factor=factor, window=window)
+    weighted = integrate_on_pixels(jnp.asarray(basis.modes, jnp.float32) * weights[None], factor=factor, window=window)
     light = np.asarray(integrate_on_pixels(weights[None], factor=factor, window=window)[0], float)
     lit = light > 0
     means = np.asarray(weighted, float)[:, lit] / np.sqrt(light[lit])

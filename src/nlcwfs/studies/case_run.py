@@ -89,14 +89,12 @@ def run_case(case: Case, config: Config, capture: Capture, light: Light, progres
         begun_s = time.perf_counter()
         found = jax.block_until_ready(reconstruct(solver, counts))
         milliseconds = 1e3 * (time.perf_counter() - begun_s)
-        scored.append(score_screen(found, screen, light, frame, modes)._replace(milliseconds=milliseconds))
+        scored.append(_scored(found, screen, light, frame, modes)._replace(milliseconds=milliseconds))
         progress(case.name, number + 1, len(light.screens))
-    return sum_up(scored, capture) | sky_columns(case, config, [one.strength for one in scored])
+    return _summed_up(scored, capture) | _sky_columns(case, config, [one.strength for one in scored])
 
 
-def score_screen(
-    found: WavefrontEstimate, screen: Screen, light: Light, frame: Grid, modes: ModeErrors | None
-) -> Scored:
+def _scored(found: WavefrontEstimate, screen: Screen, light: Light, frame: Grid, modes: ModeErrors | None) -> Scored:
     """Compare an estimate with the truth; an error that is not finite counts as `LOST_NM`."""
     opd_m = np.asarray(found.opd_m, float)
     fine_m = wavefront_error_m(opd_m, frame, screen.truth_m, light.weights, light.grid)
@@ -118,7 +116,7 @@ def score_screen(
     )
 
 
-def sum_up(scored: list[Scored], capture: Capture) -> Row:
+def _summed_up(scored: list[Scored], capture: Capture) -> Row:
     """Statistics over the screens, lost ones included."""
     fine_nm, pixels_nm = (np.array([getattr(one, name) for one in scored]) for name in ("fine_nm", "pixels_nm"))
     captured = fine_nm < capture.captured_nm
@@ -145,7 +143,7 @@ def sum_up(scored: list[Scored], capture: Capture) -> Row:
     }
 
 
-def sky_columns(case: Case, config: Config, strengths: list[float]) -> Row:
+def _sky_columns(case: Case, config: Config, strengths: list[float]) -> Row:
     """What the case was, and the strength of the turbulence that its estimates tell over the true one."""
     air = turbulence(config)
     telescope_over_fried = config.beam.diameter_m / air.fried_at(wavelength_m(config))

@@ -73,7 +73,8 @@ def _read(path: Path) -> list[Row]:
     if missing:
         rule = f"must have the columns case, group and digest (delete it to start anew), got no {missing[0]}"
         raise FileFormatError(f"{path}: {rule}")
-    return [dict(zip(names, values, strict=True)) for values in table.iterrows()]
+    columns = [_filled(table[name].tolist()) for name in names]  # numbers of Python; ECSV reads no text as None
+    return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
 def _filled(values: list[str | int | float | None]) -> list[str | int | float]:

@@ -20,7 +20,7 @@ def column(rows: Sequence[Row], name: str) -> Float[np.ndarray, " row"]:
     return np.array([float(row.get(name, np.nan)) for row in rows])
 
 
-def log_axis(axes: Axes, ticks: Sequence[float]) -> None:
+def log_axis(axes: Axes, ticks: Sequence[int | float]) -> None:
     """Make the vertical axis logarithmic, with plain numbers at these places only."""
     axes.set_yscale("log")
     axes.yaxis.set_minor_locator(NullLocator())
