@@ -44,9 +44,9 @@ def missed_by_wavefronts(
     Examples:
         >>> from nlcwfs.beam.pupil_shape import PupilShape
         >>> geometry = SensorGeometry(PupilShape(8.0), Grid((20, 20), 0.5), 0.65e-6, (3e6,))
-        >>> tilted_m = 1e-6 * np.broadcast_to(np.arange(20.0), (20, 20))  # 2 urad: 6 m at 3000 km
-        >>> missed_by_wavefronts(wide_optics(geometry, dtype="float32"), [tilted_m]).round(1).tolist()
-        [0.6]
+        >>> tilted_m = 3e-7 * np.broadcast_to(np.arange(20.0), (20, 20))  # 0.6 urad: 1.8 m at 3000 km
+        >>> missed_by_wavefronts(wide_optics(geometry, dtype="float32"), [tilted_m]).round(2).tolist()
+        [0.05]
     """
     rows, columns = wide.pupil.shape
     window = (opds_m[0].shape[0], opds_m[0].shape[1])
@@ -61,7 +61,7 @@ def missed_on_average(geometry: SensorGeometry, air: Turbulence) -> Float[np.nda
         >>> from nlcwfs.beam.pupil_shape import PupilShape
         >>> geometry = SensorGeometry(PupilShape(8.0), Grid((20, 20), 0.5), 0.65e-6, (-3e6, 0.0))
         >>> missed_on_average(geometry, Turbulence.from_seeing(seeing_arcsec=0.6)).round(2).tolist()
-        [0.08, 0.0]
+        [0.48, 0.0]
     """
     wavelength_m = geometry.wavelength_m
     light = SensedLight(geometry.pupil.diameter_m, wavelength_m, fried_m=air.fried_at(wavelength_m))

@@ -130,20 +130,18 @@ class WavefrontFile:
             _check_fits(number, frame, shape, len(modes))
 
         def column(name: str, missing: Any) -> Any:
-            values = [getattr(done[number], name) if number in done else None for number in range(shape[0])]
-            return np.array([missing if value is None else value for value in values])
+            return _column(done, name, missing, shape[0])
 
         problems = frames.frame_problems
         gaps = {number: BAD_FRAME if number in problems else NOT_RUN for number in range(shape[0])}
         outcomes = gaps | {number: frame.outcome for number, frame in done.items()}
         sentences = {n: problems.get(n, "") for n in gaps} | {n: frame.sentence for n, frame in done.items()}
-        no_modes, no_residual = np.full(len(modes), np.nan), np.full(shape[1:], np.nan)
+        no_modes = np.full(len(modes), np.nan)
 
-        def known(name: str) -> Any:
+        def known(name: str, missing: Any = np.nan) -> Any:
             told = any(getattr(frame, name) is not None for frame in done.values())
-            return column(name, np.nan) if told else None
+            return column(name, missing) if told else None
 
-        explained = any(frame.residual is not None for frame in done.values())
         return cls(
             opd_m=column("opd_m", np.full(shape[2:], np.nan)),
             has_frame_axis=frames.has_frame_axis,
@@ -164,7 +162,7 @@ class WavefrontFile:
             error_nm=column("error_nm", np.nan) if frames.truth_m is not None else known("error_nm"),
             quantum_limit_nm=known("quantum_limit_nm"),
             photon_loss=known("photon_loss"),
-            residual=column("residual", no_residual) if explained else None,
+            residual=known("residual", np.full(shape[1:], np.nan)),
             source=frames.source,
             source_digest=frames.source_digest,
         )
@@ -198,6 +196,11 @@ class WavefrontFile:
             residual=None if self.residual is None else self.residual[number],
             sentence=self.sentences[number],
         )
+
+
+def _column(done: Mapping[int, FrameWavefront], name: str, missing: Any, count: int) -> Any:
+    values = [getattr(done[number], name) if number in done else None for number in range(count)]
+    return np.array([missing if value is None else value for value in values])
 
 
 def _check_fits(number: int, frame: FrameWavefront, shape: tuple[int, ...], mode_count: int) -> None:
