@@ -143,6 +143,19 @@ def test_the_error_told_of_a_followed_frame_is_near_the_error(stream, followed):
     assert np.all((ratio > 0.6) & (ratio < 1.1))  # measured 0.73 to 0.83: turbulence within a pixel is counted as error
 
 
+def test_what_is_remembered_is_what_was_told(stream):
+    """Phase and slope in memory are the wavefront, when no mirror is known: light with a tilt of its own shows it."""
+    y_m, x_m = (centres(n, PIXEL_M / FINER) for n in FINE)
+    tilted_rad = truth_rad(1) + (4e-8 * y_m[:, None] - 3e-8 * x_m) / METRES
+    estimate, memory = stream.follow(jnp.asarray(exposure(tilted_rad, seed=72)), stream.alone[0][1], stream.flat_m)
+    slope_y, slope_x = np.asarray(memory.slope, float)
+    y_m, x_m = (centres(n, PIXEL_M) for n in FRAME)
+    remembered_m = np.asarray(memory.phase_rad, float) * METRES + slope_y * y_m[:, None] + slope_x * x_m
+    off_m = np.asarray(estimate.opd_m, float) - remembered_m
+    assert 1e9 * np.std(off_m[WEIGHT > 0]) < 0.01  # single precision
+    assert np.all(abs(np.asarray(memory.slope - stream.alone[0][1].slope)) > 1e-10)  # else its sign is not seen
+
+
 def test_a_missing_frame_does_not_lose_the_air(stream):
     memory = stream.alone[0][1]
     for _ in range(2):
