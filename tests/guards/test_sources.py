@@ -30,6 +30,8 @@ SELF_EVIDENT = 8  # lines: a function so short is its own example
 WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:window_costs": "its example is that of the estimate it belongs to",
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
+    "nlcwfs.estimation.gauss_newton:step": "needs a sensor; `MaximumAPosteriori` shows what steps lead to",
+    "nlcwfs.estimation.turn_islands:torn_phase": "needs a sensor and its light",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",

@@ -1,5 +1,7 @@
 """Frames in a row: what the last ones showed is expected of the next, so that a few FFTs a frame are enough."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -108,7 +110,12 @@ class SequenceReconstructor(eqx.Module):
         if not interval_s > 0 or not photons > 0:
             raise SettingsError("interval_s and photons", "must be positive", (interval_s, photons))
         planes, options, prior = len(geometry.distances_m), settings.map, settings.prior
-        inner = inner_steps(planes, budget=options.ffts_per_frame, steps=options.sequence_steps)
+        inner = inner_steps(
+            planes,
+            budget=options.ffts_per_frame,
+            steps=options.sequence_steps,
+            oversampling=options.oversampling,
+        )
         solver = MaximumAPosteriori.build(geometry, settings, dtype=dtype)
         grid, speed, diameter_m = solver.level.grid, prior.wind_speed_m_per_s, geometry.pupil.diameter_m
         if prior.wind_direction_deg is None:
@@ -135,7 +142,8 @@ class SequenceReconstructor(eqx.Module):
     def ffts(self) -> int:
         """FFTs of every frame after the first."""
         planes = self.solver.level.optics.transfer.shape[1]
-        return fixed_ffts(planes, inner=self.inner, steps=self.solver.settings.map.sequence_steps)
+        options = self.solver.settings.map
+        return fixed_ffts(planes, inner=self.inner, steps=options.sequence_steps, oversampling=options.oversampling)
 
     def start(
         self,
@@ -247,17 +255,20 @@ class SequenceReconstructor(eqx.Module):
         )
 
 
-def fixed_ffts(planes: int, *, inner: int, steps: int) -> int:
-    """FFTs of a frame that is followed: steps, the prediction, the model at the end.
+def fixed_ffts(planes: int, *, inner: int, steps: int, oversampling: int = 2) -> int:
+    """FFTs of a frame that is followed: steps, the prediction, the model at the end and the filters of the verdict.
+
+    The verdict filters counts and residual on the frames' pixels, whose FFTs are smaller than the model's.
 
     Examples:
-        >>> fixed_ffts(4, inner=3, steps=2)
-        97
+        >>> fixed_ffts(4, inner=3, steps=2), fixed_ffts(4, inner=3, steps=2, oversampling=1)
+        (97, 103)
     """
-    return steps * (gn.ffts_per_step(planes, inner)) + planes + 5
+    verdict = math.ceil(2 * planes / oversampling**2)
+    return steps * gn.ffts_per_step(planes, inner) + planes + 3 + verdict
 
 
-def inner_steps(planes: int, *, budget: int, steps: int) -> int:
+def inner_steps(planes: int, *, budget: int, steps: int, oversampling: int = 2) -> int:
     """Conjugate gradients of each step that a budget of FFTs allows.
 
     Raises:
@@ -268,10 +279,10 @@ def inner_steps(planes: int, *, budget: int, steps: int) -> int:
         3
     """
     inner = 0
-    while fixed_ffts(planes, inner=inner + 1, steps=steps) <= budget:
+    while fixed_ffts(planes, inner=inner + 1, steps=steps, oversampling=oversampling) <= budget:
         inner += 1
     if inner == 0:
-        least = fixed_ffts(planes, inner=1, steps=steps)
+        least = fixed_ffts(planes, inner=1, steps=steps, oversampling=oversampling)
         rule = f"must be at least {least} for {planes} planes and {steps} steps"
         raise SettingsError("estimation.map.ffts_per_frame", rule, budget)
     return inner
