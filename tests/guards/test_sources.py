@@ -31,6 +31,7 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:window_costs": "its example is that of the estimate it belongs to",
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
     "nlcwfs.estimation.gauss_newton:step": "needs a sensor; `MaximumAPosteriori` shows what steps lead to",
+    "nlcwfs.estimation.gauss_newton:direction_of_step": "the same",
     "nlcwfs.estimation.turn_islands:torn_phase": "needs a sensor and its light",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
