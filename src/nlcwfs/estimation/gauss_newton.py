@@ -148,7 +148,19 @@ def conjugate_gradients(
     prior: WhitenedPhase,
     count: int,
 ) -> Unknown:
-    """So many conjugate gradients towards `curvature^-1 gradient`, from zero, with a diagonal preconditioner."""
+    """So many conjugate gradients towards `curvature^-1 gradient`, from zero, with a diagonal preconditioner.
+
+    Examples:
+        A curvature of four for every unknown is solved by the first.
+
+        >>> from nlcwfs.beam.grid import Grid
+        >>> prior = WhitenedPhase.build(Grid((8, 8), 1.0), jnp.ones((8, 5)), tilt_rms_rad=1.0, diameter_m=8.0)
+        >>> pull = prior.start(jnp.zeros((8, 8)).at[2, 3].set(1.0), noise_variance=0.0)
+        >>> same = Unknown(jnp.ones((8, 5)), jnp.ones(2))
+        >>> found = conjugate_gradients(lambda v: plus(v, v, 3.0), pull, same, prior, 1)
+        >>> round(float(prior.dot(found, pull)), 5)
+        0.25
+    """
 
     def conditioned(v: Unknown) -> Unknown:
         return Unknown(scaled(v.waves, preconditioner.waves), v.slope * preconditioner.slope)
