@@ -24,6 +24,10 @@ AGREES = 1.0
 """Two solutions are one if they differ by less than this many expected errors: islands make ten and more (study 02)."""
 
 
+SMALLEST_ISLAND_RAD = 0.1
+"""... or by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a turn off makes 0.16 rad."""
+
+
 class Solution(NamedTuple):
     """A wavefront with its account.
 
@@ -135,7 +139,7 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
         better = last.cost < search.best.cost
         best: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), last, search.best)
         best = best._replace(steps=last.steps, ffts=last.ffts)
-        return Search(best, last, search.healings + 1, apart_rad < AGREES * sigma_rad)
+        return Search(best, last, search.healings + 1, apart_rad < jnp.maximum(AGREES * sigma_rad, SMALLEST_ISLAND_RAD))
 
     start = Search(first, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
     return jax.lax.while_loop(lambda search: ~search.agreed & (search.healings < settings.healings), again, start)
