@@ -68,8 +68,9 @@ def draw_cost(table: Sequence[Row]) -> Figure | None:
     panels[0, 0].set_ylabel("error on the pixels [nm rms]")
     panels[1, 0].set_ylabel("captured [%]")
     panels[1, 0].set_ylim(-3, 103)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    # A table that is still growing has not every method in every panel.
+    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(shown.values()), list(shown), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
