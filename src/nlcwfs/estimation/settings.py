@@ -40,7 +40,7 @@ class EstimationSettings(BaseModel):
         examples=[0.6],
         description="strength of the turbulence that the filter expects; leave out to measure it from the frames",
     )
-    prior: PriorSettings = PriorSettings()
-    map: MapSettings = MapSettings()
     gerchberg_saxton: GerchbergSaxtonSettings = GerchbergSaxtonSettings()
     linear: LinearSettings = LinearSettings()
+    map: MapSettings = MapSettings()
+    prior: PriorSettings = PriorSettings()
