@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.estimation.angle import wrap
-from nlcwfs.estimation.gauss_newton import conjugate_gradients
+from nlcwfs.estimation.gauss_newton import conjugate_gradients, plus
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
 
 NOISE = 1.0
@@ -87,12 +87,11 @@ def _fitted(
     def curvature(v: Unknown) -> Unknown:
         phase_rad = prior.phase_rad(v)
         bent = pulled([_difference(phase_rad, axis) for axis in (0, 1)])
-        return Unknown(bent.waves + v.waves, bent.slope + v.slope)
+        return plus(bent, v, 1.0)
 
-    now, goal = curvature(unknown), pulled(wanted)
-    gradient = Unknown(goal.waves - now.waves, goal.slope - now.slope)
+    gradient = plus(pulled(wanted), curvature(unknown), -1.0)
     step = conjugate_gradients(curvature, gradient, _preconditioner(prior), prior, inner)
-    return Unknown(unknown.waves + step.waves, unknown.slope + step.slope)
+    return plus(unknown, step, 1.0)
 
 
 def _preconditioner(prior: WhitenedPhase) -> Unknown:

@@ -13,6 +13,20 @@ def half_plane_frequencies(grid: Grid) -> Float[np.ndarray, "y fx"]:
     return np.hypot(grid.fy_per_m, np.fft.rfftfreq(grid.shape[1], grid.pixel_m)[None, :])
 
 
+def times_counted(columns: int) -> Float[np.ndarray, "1 fx"]:
+    """How often each wave of a real Fourier transform (`rfft2`) counts: twice where its conjugate is not stored.
+
+    Examples:
+        >>> times_counted(4).tolist(), times_counted(5).tolist()
+        ([[1.0, 2.0, 1.0]], [[1.0, 2.0, 2.0]])
+    """
+    counted = np.full((1, columns // 2 + 1), 2.0)
+    counted[:, 0] = 1.0
+    if columns % 2 == 0:
+        counted[:, -1] = 1.0
+    return counted
+
+
 def expected_power(
     grid: Grid, turbulence: Turbulence, *, wavelength_m: float, cutoff_per_m: float | None
 ) -> Float[np.ndarray, "y fx"]:
@@ -79,9 +93,5 @@ def rms_of_power(power: Float[Array, "y fx"], grid: Grid) -> Float[Array, ""]:
         0.984375
     """
     rows, columns = grid.shape
-    twice = np.full(columns // 2 + 1, 2.0)
-    twice[0] = 1.0
-    if columns % 2 == 0:
-        twice[-1] = 1.0
-    counted = power * jnp.asarray(twice[None, :], power.dtype)
+    counted = power * jnp.asarray(times_counted(columns), power.dtype)
     return jnp.sqrt((jnp.sum(counted) - counted[0, 0]) / (rows * columns))

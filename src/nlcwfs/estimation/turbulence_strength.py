@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.estimation.turbulence_filter import times_counted
 
 LARGEST_STEP = 1.5
 """One update changes the strength by no more than this factor: the first guesses of a phase are poor."""
@@ -18,11 +19,7 @@ def slope_weights(grid: Grid) -> Float[np.ndarray, "y fx"]:
     rows, columns = grid.shape
     step_y = 2 * np.sin(np.pi * grid.fy_per_m * grid.pixel_m)
     step_x = 2 * np.sin(np.pi * np.fft.rfftfreq(columns, grid.pixel_m)[None, :] * grid.pixel_m)
-    twice = np.full(columns // 2 + 1, 2.0)
-    twice[0] = 1.0
-    if columns % 2 == 0:
-        twice[-1] = 1.0
-    return (step_y**2 + step_x**2) * twice / (rows * columns)
+    return (step_y**2 + step_x**2) * times_counted(columns) / (rows * columns)
 
 
 def updated_strength(

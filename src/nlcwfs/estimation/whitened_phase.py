@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.estimation.turbulence_filter import times_counted
 
 
 class Unknown(NamedTuple):
@@ -56,18 +57,13 @@ class WhitenedPhase(eqx.Module):
             tilt_rms_rad: Rms over a disc of the tilt expected along one axis, beside the waves.
             diameter_m: Diameter of the disc.
         """
-        columns = grid.shape[1]
-        twice = np.full(columns // 2 + 1, 2.0)
-        twice[0] = 1.0
-        if columns % 2 == 0:
-            twice[-1] = 1.0
         # Noll's tilt of unit rms is 2 r / R.
         y, x = np.broadcast_to(grid.y_m, grid.shape), np.broadcast_to(grid.x_m, grid.shape)
         unit = np.stack([y, x]) * (4 / diameter_m)
         return cls(
             amplitude=jnp.sqrt(power),
             tilt=jnp.asarray(unit, power.dtype) * jnp.asarray(tilt_rms_rad, power.dtype),
-            twice=jnp.asarray(twice[None], power.dtype),
+            twice=jnp.asarray(times_counted(grid.shape[1]), power.dtype),
         )
 
     def phase_rad(self, unknown: Unknown) -> Float[Array, "y x"]:
