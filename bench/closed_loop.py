@@ -22,9 +22,10 @@ from nlcwfs.config import load_config
 from nlcwfs.estimation.frame_prediction import posterior_power
 from nlcwfs.estimation.gauss_newton import conjugate_gradients, plus
 from nlcwfs.estimation.sensor_model import PlaneScale
-from nlcwfs.estimation.sequence_reconstructor import Memory, SequenceReconstructor, fixed_ffts
+from nlcwfs.estimation.sequence_reconstructor import Memory, SequenceReconstructor
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.tilt import tilt_phase
+from nlcwfs.estimation.wave_sensitivity import LAGS
 from nlcwfs.estimation.whitened_phase import Unknown
 from nlcwfs.interop import Provenance
 from nlcwfs.simulation.exposure import frame_key
@@ -50,7 +51,7 @@ SETTINGS = [
     "simulation.light_window=1.5",
     f"simulation.rate_hz={RATE_HZ}",
 ]
-BUDGETS = ((1, 97), (2, 64), (2, 97), (2, 142), (2, 230), (3, 142), (4, 600))
+BUDGETS = ((1, 100), (2, 100), (3, 75), (3, 100), (3, 150), (3, 200), (4, 150), (4, 600))
 """Gauss-Newton steps and FFTs for each frame."""
 
 
@@ -164,6 +165,7 @@ def first_memory(sequence: SequenceReconstructor, air_m: np.ndarray, still) -> M
         tilt_left_rad=tilt_rad,
         strength=jnp.asarray(1.0, solver.power.dtype),
         scale=open_to,
+        surprise_rad2=jnp.zeros(len(LAGS), solver.power.dtype),
     )
 
 
@@ -202,9 +204,9 @@ def main() -> None:
         for simulator in simulators:
             runs.append(run(sequence, simulator, given.frames, cold=cold))
         rms = [float(np.sqrt(np.mean(each[SETTLING:] ** 2))) if len(each) == given.frames else np.inf for each in runs]
-        ffts = 1355 if cold else fixed_ffts(4, inner=sequence.inner, steps=steps)
+        ffts = 1355 if cold else sequence.ffts
         rows.append(
-            (steps, sequence.inner, ffts, round(float(np.median(rms)), 1), round(min(rms), 1), round(max(rms), 1))
+            (steps, sum(sequence.inner), ffts, round(float(np.median(rms)), 1), round(min(rms), 1), round(max(rms), 1))
         )
         print(rows[-1], f"{time.perf_counter() - started:.0f} s", flush=True)
     table = Table(rows=rows, names=("steps", "conjugate_gradients", "ffts", "rms_nm", "lowest_nm", "highest_nm"))

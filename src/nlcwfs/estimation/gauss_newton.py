@@ -32,6 +32,7 @@ class Problem(NamedTuple):
         known_rad: Phase that is known beforehand: starting tilt, static aberration, prior mean.
         prior: What is expected of the rest.
         information: Mean Fisher information of the phase of one cell (1/rad^2), for the preconditioner.
+        shown: What each unknown has of that, see `wave_sensitivity`; 1 in speckled light.
     """
 
     expected: Callable[[Float[Array, "y x"]], Float[Array, "plane v u"]]
@@ -41,6 +42,7 @@ class Problem(NamedTuple):
     known_rad: Float[Array, "y x"]
     prior: WhitenedPhase
     information: Float[Array, ""]
+    shown: Unknown
 
 
 class GaussNewtonState(eqx.Module):
@@ -183,11 +185,11 @@ def conjugate_gradients(
 
 def preconditioner(problem: Problem) -> Unknown:
     """Inverse of the diagonal of the curvature, `1 / (1 + fill * information * P)` for each wave."""
-    prior = problem.prior
-    waves = 1 / (1 + FILL * problem.information * prior.amplitude**2)
+    prior, shown = problem.prior, problem.shown
+    waves = 1 / (1 + FILL * problem.information * shown.waves * prior.amplitude**2)
     lit = jnp.sum(prior.tilt**2, axis=(1, 2))
     # A tilt reaches beyond the pupil: a disc in a window holds at least an eighth of its squares.
-    return Unknown(waves, 1 / (1 + problem.information * lit / 8))
+    return Unknown(waves, 1 / (1 + problem.information * shown.slope * lit / 8))
 
 
 def ffts_per_step(planes: int, inner: int) -> int:

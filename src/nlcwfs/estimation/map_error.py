@@ -26,8 +26,15 @@ CARRIED = 0.5
 """Modes told over lit pixels: the fastest have 0.8 of a half cycle per pixel."""
 
 UNSEEN = 2.0
-"""The light is known only as far as the phase is: an error of s rad^2 makes the variances 1 + 2 s times larger than the
-information at the estimate says. Measured with 0.03 to 0.12 rad^2 (study 02)."""
+"""The light is known only as far as the phase is: an error of s rad^2 makes the variance 1 + 2 s times larger than the
+information at the estimate says. Measured with 0.02 to 0.14 rad^2."""
+
+UNSEEN_SLOW = 4.0
+"""The same for the slowest modes: what is wrong with the speckles of fine waves passes for slow ones."""
+
+UNSEEN_HALF_CPA = 8.0
+"""... half as much for a mode of so many cycles per aperture. Both were measured on 60 screens each at D / r0 of 8.2
+(2e3, 2e4, 2e5 photons) and 15, other screens than those of study 02, which judges them."""
 
 
 class MapError(eqx.Module):
@@ -37,11 +44,15 @@ class MapError(eqx.Module):
         level: The sensor on the grid of the model.
         modes: Modes whose errors are told, on the measured pixels of the model's window.
         strength_one: (D / r0)^(5/3) for turbulence of strength 1.
+        averaged: Share of each mode's variance that the mean over detector pixels keeps.
+        unseen: Growth of each mode's variance with the error of the phase, over rad^2.
     """
 
     level: Level
     modes: ModesInBands
     strength_one: Float[Array, ""]
+    averaged: Float[Array, " mode"]
+    unseen: Float[Array, " mode"]
 
     @classmethod
     def build(
@@ -61,17 +72,20 @@ class MapError(eqx.Module):
         pupil = geometry.pupil.on(window)
         count = max(1, min(settings.modes, int(CARRIED * np.sum(pupil**2))))
         basis = modal_basis(pupil, window, diameter_m=diameter_m, count=count)
+        cycles = np.asarray(basis.cycles_per_aperture, float)
         return cls(
             level=level,
             modes=ModesInBands.build(basis, dtype=dtype),
             strength_one=jnp.asarray((diameter_m / air.fried_at(wavelength_m)) ** (5 / 3), dtype),
+            averaged=jnp.asarray(kept_by_pixels(cycles * window.pixel_m / diameter_m), dtype),
+            unseen=jnp.asarray(UNSEEN_SLOW / (1 + (cycles / UNSEEN_HALF_CPA) ** 2), dtype),
         )
 
     def bars(self, task: Task, phase_rad: Float[Array, "y x"], strength: Float[Array, ""]) -> ErrorBars:
-        """Error of every mode at a wavefront, on the model's grid with everything included."""
+        """Error of every mode of the wavefront's mean over pixels; the phase is on the model's grid, and whole."""
         problem, level = task.problem, self.level
         model, along = jax.linearize(problem.expected, phase_rad)
-        return error_bars(
+        bars = error_bars(
             lambda pixels: along(level.on_cells(pixels[None])[0]),
             jnp.where(problem.usable, model + problem.dark, jnp.inf),
             self.modes,
@@ -79,6 +93,10 @@ class MapError(eqx.Module):
             photons=jnp.maximum(jnp.sum(problem.counts), 1),
             key=jax.random.key(SEED),
         )
+        grown = self.averaged * (1 + self.unseen * bars.wavefront_rad**2)
+        root = jnp.sqrt(grown[: self.modes.slow])
+        changed = grown * bars.mode_rad2, root[:, None] * bars.slow_rad2 * root[None]
+        return eqx.tree_at(lambda told: (told.mode_rad2, told.slow_rad2), bars, changed)
 
     def told_rad(self, bars: ErrorBars, strength: Float[Array, ""], believed: Bool[Array, ""]) -> Float[Array, ""]:
         """Expected rms error of the wavefront; the error bars count the turbulence finer than the modes.
@@ -90,3 +108,15 @@ class MapError(eqx.Module):
         known = jnp.sqrt(square * (1 + UNSEEN * square))
         unknown = jnp.sqrt(NOLL * self.strength_one * jnp.maximum(strength, 1))
         return jnp.where(believed, known, unknown)
+
+
+def kept_by_pixels(cycles_per_pixel: Float[np.ndarray, " mode"]) -> Float[np.ndarray, " mode"]:
+    """Share of the variance of waves, of any direction, that the mean over square pixels keeps.
+
+    Examples:
+        >>> kept_by_pixels(np.array([0.0, 0.1, 0.5])).round(2).tolist()
+        [1.0, 0.97, 0.41]
+    """
+    angle = (np.arange(32) + 0.5) * (np.pi / 2 / 32)
+    along = np.sinc(cycles_per_pixel[:, None] * np.cos(angle)) * np.sinc(cycles_per_pixel[:, None] * np.sin(angle))
+    return np.mean(along**2, axis=1)

@@ -56,5 +56,5 @@ class MapSettings(BaseModel):
         default=100, ge=1, le=1000000, description="FFTs for each frame of a sequence after the first; fixed"
     )
     sequence_steps: int = Field(
-        default=2, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"
+        default=3, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"
     )

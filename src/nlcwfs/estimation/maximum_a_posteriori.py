@@ -239,6 +239,7 @@ class MaximumAPosteriori(eqx.Module):
             known_rad=known_rad,
             prior=prior,
             information=4 * jnp.maximum(photons, 1) / (SENSOR_LOSS * lit),
+            shown=Unknown(jnp.ones((), self.power.dtype), jnp.ones(2, self.power.dtype)),
         )
         return Task(problem, level, measured, scale, self.beyond_cells * strength)
 

@@ -1,6 +1,6 @@
 """Frames in a row: what the last ones showed is expected of the next, so that a few FFTs a frame are enough."""
 
-import math
+import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,15 +25,20 @@ from nlcwfs.estimation.reconstructor import SENSOR_LOSS
 from nlcwfs.estimation.resolution_level import Measurement, cropped
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.sensor_model import PlaneScale
+from nlcwfs.estimation.sequence_budget import fixed_ffts, inner_steps
 from nlcwfs.estimation.settings import EstimationSettings
-from nlcwfs.estimation.turbulence_filter import rms_of_power
+from nlcwfs.estimation.turbulence_filter import half_plane_frequencies, rms_of_power
+from nlcwfs.estimation.wave_sensitivity import LAGS, roughness, seen_share
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown
 
-TRUST = 0.9
+TRUST = 0.8
 """Share of the prediction in what is expected; the rest is air that has never been seen. Air comes in over the rim of
 the pupil, which a filter that is diagonal in Fourier space cannot know: without it a loop that knows its wind ends at
-143 nm, with it at 72 (`bench/closed_loop.py`)."""
+143 nm, with nine tenths at 72 (`bench/closed_loop.py`)."""
+
+TILT_CYCLES = 1.0
+"""A tilt is seen as well as a wave of so many cycles per aperture: the rim of the pupil moves."""
 
 
 class Memory(eqx.Module):
@@ -46,6 +51,7 @@ class Memory(eqx.Module):
         tilt_left_rad: Rms error of the tilt along one axis.
         strength: Variance of the turbulence over that of the prior.
         scale: Counts of each plane over those measured, and background.
+        surprise_rad2: Roughness of what the last frame showed beyond its prediction, see `wave_sensitivity`.
     """
 
     phase_rad: Float[Array, "y x"]
@@ -54,6 +60,7 @@ class Memory(eqx.Module):
     tilt_left_rad: Float[Array, ""]
     strength: Float[Array, ""]
     scale: PlaneScale
+    surprise_rad2: Float[Array, " lag"]
 
 
 class SequenceReconstructor(eqx.Module):
@@ -75,13 +82,13 @@ class SequenceReconstructor(eqx.Module):
         >>> geometry = SensorGeometry(PupilShape(8.0), Grid((32, 32), 0.36), 0.65e-6, (-3.5e6, -2.5e6, 2.5e6, 3.5e6))
         >>> sequence = SequenceReconstructor.build(geometry, EstimationSettings(modes=100), interval_s=0.004)
         >>> sequence.inner, sequence.ffts
-        (3, 97)
+        ((2, 2, 1), 97)
     """
 
     solver: MaximumAPosteriori
     correlation: Array
     tilt_correlation: float = eqx.field(static=True)
-    inner: int = eqx.field(static=True)
+    inner: tuple[int, ...] = eqx.field(static=True)
     interval_s: float = eqx.field(static=True)
 
     @classmethod
@@ -142,8 +149,7 @@ class SequenceReconstructor(eqx.Module):
     def ffts(self) -> int:
         """FFTs of every frame after the first."""
         planes = self.solver.level.optics.transfer.shape[1]
-        options = self.solver.settings.map
-        return fixed_ffts(planes, inner=self.inner, steps=options.sequence_steps, oversampling=options.oversampling)
+        return fixed_ffts(planes, inner=self.inner, oversampling=self.solver.settings.map.oversampling)
 
     def start(
         self,
@@ -160,7 +166,7 @@ class SequenceReconstructor(eqx.Module):
         scale = PlaneScale(task.scale.counts / total, task.scale.background)
         rms_rad = solver.tilt_rms_rad * jnp.sqrt(strength)
         memory = self._remembered(task, unknown, found.slope, jnp.zeros_like(task.problem.known_rad), rms_rad)
-        return solver.account(found), Memory(*memory, strength, scale)
+        return solver.account(found), Memory(*memory, strength, scale, jnp.zeros(len(LAGS), strength.dtype))
 
     def follow(
         self,
@@ -194,13 +200,16 @@ class SequenceReconstructor(eqx.Module):
         total = _plane_counts(measured)
         scale = PlaneScale(memory.scale.counts * total, memory.scale.background)
         task = solver.task(measured, known_rad, scale, prior, memory.strength)
+        shown = self._shown(roughness(known_rad, level) + memory.surprise_rad2)
+        task = task._replace(problem=task.problem._replace(shown=shown))
         unknown = prior.nothing()
-        for _ in range(options.sequence_steps):
-            direction, _ = gn.direction_of_step(task.problem, self.inner, unknown)
+        for inner in self.inner:
+            direction, _ = gn.direction_of_step(task.problem, inner, unknown)
             unknown = gn.plus(unknown, direction, 1.0)
         parts = self._remembered(task, unknown, memory.slope, expected.phase_rad, expected.tilt_left_rad)
         estimate = self._account(task, unknown, parts, memory.strength)
-        return estimate, Memory(*parts, memory.strength, memory.scale)
+        surprise_rad2 = roughness(parts[0] - expected.phase_rad, level)
+        return estimate, Memory(*parts, memory.strength, memory.scale, surprise_rad2)
 
     def skip(self, memory: Memory) -> Memory:
         """What is expected one interval later; call it for every frame that is missing."""
@@ -211,7 +220,20 @@ class SequenceReconstructor(eqx.Module):
         again = self.tilt_correlation**2
         tilt = solver.tilt_rms_rad**2 * memory.strength
         tilt_left_rad = jnp.sqrt(again * memory.tilt_left_rad**2 + (1 - again) * tilt)
-        return Memory(mean_rad, memory.slope, left_open, tilt_left_rad, memory.strength, memory.scale)
+        return dataclasses.replace(memory, phase_rad=mean_rad, left_open=left_open, tilt_left_rad=tilt_left_rad)
+
+    def _shown(self, rough_rad2: Float[Array, " lag"]) -> Unknown:
+        """Share of the information that waves and tilt get from a wavefront of this roughness."""
+        level, geometry = self.solver.level, self.solver.geometry
+        sensor = {
+            "pixel_m": level.grid.pixel_m,
+            "distances_m": geometry.distances_m,
+            "fractions": level.optics.flux_fractions,
+            "wavelength_m": geometry.wavelength_m,
+        }
+        waves = seen_share(half_plane_frequencies(level.grid), rough_rad2, **sensor)
+        tilt = seen_share(np.full(2, TILT_CYCLES / geometry.pupil.diameter_m), rough_rad2, **sensor)
+        return Unknown(waves, tilt)
 
     def _remembered(
         self, task: Task, unknown: Unknown, slope: Float[Array, "2"], mean_rad: Float[Array, "y x"], rms_rad: Array
@@ -222,8 +244,8 @@ class SequenceReconstructor(eqx.Module):
         diameter_m, wavelength_m = self.solver.geometry.pupil.diameter_m, self.solver.geometry.wavelength_m
         # A tilt of unit rms over a disc is 2 r / R (Noll).
         slope = slope + unknown.slope * rms_rad * (4 / diameter_m * wavelength_m / (2 * np.pi))
-        left_open = posterior_power(prior.amplitude**2, problem.information)
-        seen = problem.information * jnp.sum(level.light)
+        left_open = posterior_power(prior.amplitude**2, problem.information * problem.shown.waves)
+        seen = problem.information * problem.shown.slope[0] * jnp.sum(level.light)
         return phase_rad, slope, left_open, jnp.sqrt(rms_rad**2 / (1 + rms_rad**2 * seen))
 
     def _account(self, task: Task, unknown: Unknown, parts: tuple, strength: Float[Array, ""]) -> WavefrontEstimate:
@@ -253,39 +275,6 @@ class SequenceReconstructor(eqx.Module):
             outcome_code=code,
             strength=strength,
         )
-
-
-def fixed_ffts(planes: int, *, inner: int, steps: int, oversampling: int = 2) -> int:
-    """FFTs of a frame that is followed: steps, the prediction, the model at the end and the filters of the verdict.
-
-    The verdict filters counts and residual on the frames' pixels, whose FFTs are smaller than the model's.
-
-    Examples:
-        >>> fixed_ffts(4, inner=3, steps=2), fixed_ffts(4, inner=3, steps=2, oversampling=1)
-        (97, 103)
-    """
-    verdict = math.ceil(2 * planes / oversampling**2)
-    return steps * gn.ffts_per_step(planes, inner) + planes + 3 + verdict
-
-
-def inner_steps(planes: int, *, budget: int, steps: int, oversampling: int = 2) -> int:
-    """Conjugate gradients of each step that a budget of FFTs allows.
-
-    Raises:
-        SettingsError: If it does not allow one.
-
-    Examples:
-        >>> inner_steps(4, budget=100, steps=2)
-        3
-    """
-    inner = 0
-    while fixed_ffts(planes, inner=inner + 1, steps=steps, oversampling=oversampling) <= budget:
-        inner += 1
-    if inner == 0:
-        least = fixed_ffts(planes, inner=1, steps=steps, oversampling=oversampling)
-        rule = f"must be at least {least} for {planes} planes and {steps} steps"
-        raise SettingsError("estimation.map.ffts_per_frame", rule, budget)
-    return inner
 
 
 def _plane_counts(measured: Measurement) -> Float[Array, "plane 1 1"]:
