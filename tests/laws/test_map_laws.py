@@ -333,6 +333,7 @@ def _stepped(level: Level, counts, usable, power):
         known_rad=jnp.zeros(level.grid.shape),
         prior=prior,
         information=jnp.asarray(5.0),
+        shown=Unknown(jnp.ones(()), jnp.ones(2)),
     )
     state = gn.init(problem, prior.nothing())
     for _ in range(2):

@@ -81,6 +81,7 @@ def linear_problem(expected: Callable | None = None, **changes) -> gn.Problem:
         "known_rad": jnp.asarray(KNOWN_RAD),
         "prior": prior(),
         "information": jnp.asarray(10.0),
+        "shown": Unknown(jnp.ones(()), jnp.ones(2)),
     }
     return gn.Problem(**given | ({"expected": expected} if expected else {}) | changes)
 
@@ -198,6 +199,7 @@ def sensor_problem(optics: Level, *, strength: float = 1.0, truth_rad=0.0, known
         known_rad=flat + known_rad,
         prior=WhitenedPhase.build(optics.grid, jnp.asarray(power), tilt_rms_rad=1.0, diameter_m=8.0),
         information=jnp.asarray(40.0),
+        shown=Unknown(jnp.ones(()), jnp.ones(2)),
     )
 
 

@@ -100,7 +100,11 @@ class ModesInBands(eqx.Module):
 
     def phase_rad(self, coefficients: Float[Array, " mode"]) -> Float[Array, "y x"]:
         """The phase with these coefficients, zero where there is no light."""
-        return jnp.zeros(self.shape, self.modes.dtype).at[self.rows, self.columns].set(coefficients @ self.modes)
+        return self.on_window(coefficients @ self.modes)
+
+    def on_window(self, lit: Float[Array, " lit"]) -> Float[Array, "y x"]:
+        """Values of the lit pixels, zero elsewhere."""
+        return jnp.zeros(self.shape, self.modes.dtype).at[self.rows, self.columns].set(lit)
 
     def mean_in_bands(self, values: Float[Array, " mode"], weights: Float[Array, " mode"]) -> Float[Array, " band"]:
         """Weighted mean over the modes of every band; 0 for a band without weight."""
@@ -182,12 +186,13 @@ def error_bars(
     mixtures = signs[:-1] * jax.lax.rsqrt(typical + 1 / prior)[None]  # each mode by as much as it is uncertain
     back = jax.linear_transpose(along, jax.ShapeDtypeStruct(modes.shape, dtype))
 
-    def pushed(coefficients: Float[Array, " mode"]) -> Float[Array, " mode"]:
-        """The Fisher matrix times coefficients."""
-        (slope,) = back(weight * along(modes.phase_rad(coefficients)))
-        return modes.modes @ slope[modes.rows, modes.columns]
+    def pushed(lit: Float[Array, " lit"]) -> Float[Array, " lit"]:
+        """The Fisher matrix of the pixels times a phase."""
+        (slope,) = back(weight * along(modes.on_window(lit)))
+        return slope[modes.rows, modes.columns]
 
-    seen = jax.lax.map(pushed, jnp.concatenate([jnp.eye(slow, prior.size, dtype=dtype), mixtures]))
+    pushes = jnp.concatenate([jnp.eye(slow, prior.size, dtype=dtype), mixtures])
+    seen = jax.lax.map(pushed, pushes @ modes.modes) @ modes.modes.T  # all at once: the modes are read only twice
     alone = jnp.pad(jnp.diag(seen[:slow, :slow]), (0, prior.size - slow))
     own = jnp.mean(seen[slow:] * mixtures, axis=0) * (typical + 1 / prior)
     information = jnp.where(fast > 0, modes.spread(own, fast), alone)

@@ -189,7 +189,7 @@ class SequenceReconstructor(eqx.Module):
         Returns:
             The wavefront that the sensor saw, `known_m` included, and the memory of what is followed, without it.
         """
-        solver, options = self.solver, self.solver.settings.map
+        solver = self.solver
         level, wavelength_m = solver.level, self.solver.geometry.wavelength_m
         expected = self.skip(memory)
         measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
