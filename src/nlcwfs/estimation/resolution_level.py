@@ -115,7 +115,7 @@ def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "p
     if factor == 1:
         return array
     # Ten times faster than a sum over axes of `factor` pixels, which JAX walks through one by one.
-    rows = sum(array[:, first::factor] for first in range(factor))
+    rows = jnp.asarray(sum(array[:, first::factor] for first in range(factor)))
     return jnp.asarray(sum(rows[:, :, first::factor] for first in range(factor)))
 
 
