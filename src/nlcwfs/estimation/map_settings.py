@@ -52,6 +52,13 @@ class MapSettings(BaseModel):
         default=8, ge=1, le=1000, description="Gerchberg-Saxton iterations on the field of each try"
     )
     healing_gain: float = Field(default=2.0, gt=0, le=10, description="length of their steps")
+    agreement: float = Field(
+        default=1.0,
+        gt=0,
+        le=10,
+        description="two solutions are one if they differ by less than this many expected errors; less than 1 finds "
+        "smaller islands where the turbulence is very strong, for more healings",
+    )
     ffts_per_frame: int = Field(
         default=100, ge=1, le=1000000, description="FFTs for each frame of a sequence after the first; fixed"
     )

@@ -20,12 +20,8 @@ LIT = 0.3
 """Cells with at least this share of the light of a full one have a phase of their own."""
 
 
-AGREES = 1.0
-"""Two solutions are one if they differ by less than this many expected errors: islands make ten and more (study 02)."""
-
-
 SMALLEST_ISLAND_RAD = 0.1
-"""... or by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a turn off makes 0.16 rad."""
+"""Two solutions are one if they differ by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a turn off makes 0.16 rad."""
 
 
 class Solution(NamedTuple):
@@ -132,6 +128,7 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
     """
     first = solved(task, settings, unknown, before)
     sigma_rad = expected_error(task.problem.prior.amplitude**2, 1 / task.problem.information, task.level.grid)
+    near_rad = jnp.maximum(settings.agreement * sigma_rad, SMALLEST_ISLAND_RAD)
 
     def again(search: Search) -> Search:
         last = healed(task, settings, search.last)
@@ -139,7 +136,7 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
         better = last.cost < search.best.cost
         best: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), last, search.best)
         best = best._replace(steps=last.steps, ffts=last.ffts)
-        return Search(best, last, search.healings + 1, apart_rad < jnp.maximum(AGREES * sigma_rad, SMALLEST_ISLAND_RAD))
+        return Search(best, last, search.healings + 1, apart_rad < near_rad)
 
     start = Search(first, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
     return jax.lax.while_loop(lambda search: ~search.agreed & (search.healings < settings.healings), again, start)
