@@ -21,7 +21,8 @@ LIT = 0.3
 
 
 SMALLEST_ISLAND_RAD = 0.1
-"""Two solutions are one if they differ by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a turn off makes 0.16 rad."""
+"""Two solutions are one if they differ by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a
+turn off makes 0.16 rad."""
 
 
 class Solution(NamedTuple):
