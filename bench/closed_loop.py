@@ -22,7 +22,8 @@ from nlcwfs.config import load_config
 from nlcwfs.estimation.frame_prediction import posterior_power
 from nlcwfs.estimation.gauss_newton import conjugate_gradients, plus
 from nlcwfs.estimation.sensor_model import PlaneScale
-from nlcwfs.estimation.sequence_reconstructor import Memory, SequenceReconstructor
+from nlcwfs.estimation.sequence_memory import Memory
+from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.tilt import tilt_phase
 from nlcwfs.estimation.wave_sensitivity import LAGS

@@ -169,13 +169,28 @@ class MaximumAPosteriori(eqx.Module):
         found = self.found(self.capture.measurement(counts, usable, read_variance), start_m)
         return self.account(found)
 
-    def found(self, near: Measurement, start_m: Float[Array, "y x"] | None = None) -> Found:
-        """All that the estimate is made of: first guess, solutions, healings."""
+    def found(
+        self,
+        near: Measurement,
+        start_m: Float[Array, "y x"] | None = None,
+        mirror_rad: Float[Array, "y x"] | None = None,
+    ) -> Found:
+        """All that the estimate is made of: first guess, solutions, healings.
+
+        With the shape of a mirror that was taken out before the sensor saw the rest, the whole turbulence is found.
+        """
         slope, climb = self.capture.search(near, start_m)
+        if mirror_rad is not None:
+            climb = eqx.tree_at(lambda c: c.phase_rad, climb, climb.phase_rad + self.on_capture(mirror_rad))
         climb = eqx.tree_at(lambda c: c.strength, climb, self.measured_strength(near, climb))
-        task, unknown = self.prepared(near, slope, climb)
+        task, unknown = self.prepared(near, slope, climb, mirror_rad)
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
         return Found(task, search, slope, climb.strength)
+
+    def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        """A phase of the model's grid on that of the first guess."""
+        factor = self.level.oversampling
+        return cropped(sum_blocks(phase_rad[None], factor)[0] / factor**2, self.capture.levels[-1].grid.shape)
 
     def measured_strength(self, near: Measurement, climb: Climb) -> Float[Array, ""]:
         """The strength that the first guess shows: the coarse levels on the way could not see its fine waves."""
@@ -188,7 +203,13 @@ class MaximumAPosteriori(eqx.Module):
             strength = updated_strength(strength, climb.phase_rad, level.light, level.power[0], weights, noise)
         return strength / SHOWN
 
-    def prepared(self, near: Measurement, slope: Float[Array, "2"], climb: Climb) -> tuple[Task, Unknown]:
+    def prepared(
+        self,
+        near: Measurement,
+        slope: Float[Array, "2"],
+        climb: Climb,
+        mirror_rad: Float[Array, "y x"] | None = None,
+    ) -> tuple[Task, Unknown]:
         """The task of one exposure and the first guess, on the grid of the model."""
         level = self.level
         fine = [size * level.oversampling for size in near.counts.shape[1:]]
@@ -196,7 +217,7 @@ class MaximumAPosteriori(eqx.Module):
         margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
         phase_rad = jnp.pad(phase_rad, margins, mode="edge")
         measured = near.padded(level.measured_shape)
-        known_rad = self.known_rad(slope)
+        known_rad = self.known_rad(slope) - (0 if mirror_rad is None else mirror_rad)
         scale = self.plane_scale(measured, known_rad + phase_rad)
         prior = self.prior(self.power * climb.strength, self.tilt_rms_rad * jnp.sqrt(climb.strength))
         task = self.task(measured, known_rad, scale, prior, climb.strength)
@@ -246,10 +267,9 @@ class MaximumAPosteriori(eqx.Module):
     def account(self, found: Found) -> WavefrontEstimate:
         """Wavefront, error bars and verdict of the best solution."""
         task, best, strength = found.task, found.search.best, found.strength
-        wavelength_m = self.geometry.wavelength_m
-        phase_rad = task.problem.prior.phase_rad(best.unknown) + tilt_phase(found.slope, self.level.grid, wavelength_m)
         metres = self.geometry.wavelength_m / (2 * np.pi)
-        opd_m = self.on_frame(phase_rad) * metres
+        phase_rad = task.problem.known_rad + task.problem.prior.phase_rad(best.unknown)
+        opd_m = self.on_frame(phase_rad) * metres - self.on_frame(self.level.optics.static_opd_m)
         light = self.on_frame(self.level.light)
         opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
         measured, shape = task.measured, self.geometry.frame.shape
@@ -257,7 +277,7 @@ class MaximumAPosteriori(eqx.Module):
         code = map_verdict(
             found.search, unexplained=unexplained, measured=measured, finite=jnp.all(jnp.isfinite(opd_m))
         )
-        bars = self.error.bars(task, task.problem.known_rad + task.problem.prior.phase_rad(best.unknown), strength)
+        bars = self.error.bars(task, phase_rad, strength)
         believed = (code == Outcome.CONVERGED) | (code == Outcome.BUDGET_SPENT)
         told = self.error.told_rad(bars, strength, believed) * metres
         residual = jnp.where(measured.usable, measured.counts - best.model, 0)

@@ -17,16 +17,18 @@ from nlcwfs.estimation.frame_prediction import (
     unseen_share,
     wind_carriage,
 )
-from nlcwfs.estimation.map_solution import Task
+from nlcwfs.estimation.map_solution import Task, searched
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
-from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
+from nlcwfs.estimation.maximum_a_posteriori import START_NOISE, Found, MaximumAPosteriori
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS
-from nlcwfs.estimation.resolution_level import Measurement, cropped
+from nlcwfs.estimation.resolution_level import cropped
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.estimation.sequence_budget import fixed_ffts, inner_steps
+from nlcwfs.estimation.sequence_memory import Memory, plane_counts
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.tilt import mean_slope, tilt_phase
 from nlcwfs.estimation.turbulence_filter import half_plane_frequencies, rms_of_power
 from nlcwfs.estimation.wave_sensitivity import LAGS, roughness, seen_share
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
@@ -39,28 +41,6 @@ the pupil, which a filter that is diagonal in Fourier space cannot know: without
 
 TILT_CYCLES = 1.0
 """A tilt is seen as well as a wave of so many cycles per aperture: the rim of the pupil moves."""
-
-
-class Memory(eqx.Module):
-    """What is known when a frame has been seen.
-
-    Attributes:
-        phase_rad: Phase on the model's grid without tilt and static aberration.
-        slope: Tilt (y, x), metres per metre.
-        left_open: Power of the error of the phase.
-        tilt_left_rad: Rms error of the tilt along one axis.
-        strength: Variance of the turbulence over that of the prior.
-        scale: Counts of each plane over those measured, and background.
-        surprise_rad2: Roughness of what the last frame showed beyond its prediction, see `wave_sensitivity`.
-    """
-
-    phase_rad: Float[Array, "y x"]
-    slope: Float[Array, "2"]
-    left_open: Float[Array, "y fx"]
-    tilt_left_rad: Float[Array, ""]
-    strength: Float[Array, ""]
-    scale: PlaneScale
-    surprise_rad2: Float[Array, " lag"]
 
 
 class SequenceReconstructor(eqx.Module):
@@ -157,16 +137,59 @@ class SequenceReconstructor(eqx.Module):
         usable: Bool[Array, "plane y x"],
         *,
         read_variance: float | Float[Array, ""] = 0.0,
+        known_m: Float[Array, "y x"] | None = None,
     ) -> tuple[WavefrontEstimate, Memory]:
-        """The wavefront of a first frame, and what it tells of the next."""
-        solver = self.solver
-        found = solver.found(solver.capture.measurement(counts, usable, read_variance))
-        task, unknown, strength = found.task, found.search.best.unknown, found.strength
-        total = _plane_counts(task.measured)
+        """The wavefront of a first frame, and what it tells of the next; arguments as for `follow`."""
+        solver, grid = self.solver, self.solver.level.grid
+        near = solver.capture.measurement(counts, usable, read_variance)
+        if known_m is None:
+            found = solver.found(near)
+            return solver.account(found), self._begun(found)
+        # The tilt of the mirror goes to the tilt of the air, which no periodic window can hold.
+        slope = mean_slope(known_m, solver.level.light, grid).astype(solver.power.dtype)
+        rest_rad = self._phase_of(known_m) - tilt_phase(slope, grid, solver.geometry.wavelength_m)
+        found = solver.found(near, mirror_rad=-rest_rad)
+        memory = self._begun(found)
+        return solver.account(found), dataclasses.replace(memory, slope=memory.slope - slope)
+
+    def look_again(
+        self,
+        counts: Float[Array, "plane y x"],
+        usable: Bool[Array, "plane y x"],
+        memory: Memory,
+        *,
+        read_variance: float | Float[Array, ""] = 0.0,
+        known_m: Float[Array, "y x"] | None = None,
+    ) -> tuple[WavefrontEstimate, Memory]:
+        """A second, slow look at a frame that was followed: islands that came in over the rim are brought back.
+
+        As many FFTs as a frame on its own takes, without its first guess. The more likely wavefront is kept.
+        Arguments as for `follow`, but `memory` is what that has returned for this very frame.
+        """
+        solver, level, strength = self.solver, self.solver.level, memory.strength
+        measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
+        known_rad = solver.known_rad(memory.slope) + (0 if known_m is None else self._phase_of(known_m))
+        scale = solver.plane_scale(measured, known_rad + memory.phase_rad)
+        prior = solver.prior(solver.power * strength, solver.tilt_rms_rad * jnp.sqrt(strength))
+        task = solver.task(measured, known_rad, scale, prior, strength)
+        unknown = prior.start(memory.phase_rad, noise_variance=START_NOISE / task.problem.information)
+        none = jnp.asarray(0, jnp.int32)
+        found = Found(task, searched(task, solver.settings.map, unknown, (none, none)), memory.slope, strength)
+        again = dataclasses.replace(self._begun(found), surprise_rad2=memory.surprise_rad2)
+        return solver.account(found), again
+
+    def _begun(self, found: Found) -> Memory:
+        """What a frame on its own tells of the next."""
+        solver, task, strength = self.solver, found.task, found.strength
+        total = plane_counts(task.measured)
         scale = PlaneScale(task.scale.counts / total, task.scale.background)
         rms_rad = solver.tilt_rms_rad * jnp.sqrt(strength)
-        memory = self._remembered(task, unknown, found.slope, jnp.zeros_like(task.problem.known_rad), rms_rad)
-        return solver.account(found), Memory(*memory, strength, scale, jnp.zeros(len(LAGS), strength.dtype))
+        flat = jnp.zeros_like(task.problem.known_rad)
+        parts = self._remembered(task, found.search.best.unknown, found.slope, flat, rms_rad)
+        return Memory(*parts, strength, scale, jnp.zeros(len(LAGS), strength.dtype))
+
+    def _phase_of(self, opd_m: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        return opd_m.astype(self.solver.power.dtype) * (2 * np.pi / self.solver.geometry.wavelength_m)
 
     def follow(
         self,
@@ -190,14 +213,14 @@ class SequenceReconstructor(eqx.Module):
             The wavefront that the sensor saw, `known_m` included, and the memory of what is followed, without it.
         """
         solver = self.solver
-        level, wavelength_m = solver.level, self.solver.geometry.wavelength_m
+        level = solver.level
         expected = self.skip(memory)
         measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
         known_rad = solver.known_rad(memory.slope) + expected.phase_rad
         if known_m is not None:
-            known_rad = known_rad + known_m.astype(known_rad.dtype) * (2 * np.pi / wavelength_m)
+            known_rad = known_rad + self._phase_of(known_m)
         prior = solver.prior(expected.left_open, expected.tilt_left_rad)
-        total = _plane_counts(measured)
+        total = plane_counts(measured)
         scale = PlaneScale(memory.scale.counts * total, memory.scale.background)
         task = solver.task(measured, known_rad, scale, prior, memory.strength)
         shown = self._shown(roughness(known_rad, level) + memory.surprise_rad2)
@@ -275,8 +298,3 @@ class SequenceReconstructor(eqx.Module):
             outcome_code=code,
             strength=strength,
         )
-
-
-def _plane_counts(measured: Measurement) -> Float[Array, "plane 1 1"]:
-    counts = jnp.sum(jnp.where(measured.usable, measured.counts, 0), axis=(1, 2), keepdims=True)
-    return jnp.maximum(counts, jnp.finfo(counts.dtype).tiny)

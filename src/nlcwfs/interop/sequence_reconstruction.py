@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from nlcwfs.errors import SettingsError
-from nlcwfs.estimation.sequence_reconstructor import Memory, SequenceReconstructor
+from nlcwfs.estimation.sequence_memory import Memory
+from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frame_times import FrameTimes
