@@ -22,6 +22,9 @@ from nlcwfs.detector.presets import IDEAL
 from nlcwfs.detector.settings import DetectorSettings
 from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.feedback.settings import FeedbackSettings
+from nlcwfs.mirror.settings import MirrorSettings
+from nlcwfs.simulation.loop_settings import LoopSettings
 from nlcwfs.simulation.settings import SimulationSettings
 
 _PRESET = ["detector", "preset"]
@@ -59,6 +62,9 @@ class Config(BaseModel):
     curvature_sensor: CurvatureSensorSettings = Field(default_factory=CurvatureSensorSettings)
     detector: DetectorSettings = Field(default_factory=DetectorSettings)
     estimation: EstimationSettings = Field(default_factory=EstimationSettings)
+    feedback: FeedbackSettings = Field(default_factory=FeedbackSettings)
+    loop: LoopSettings = Field(default_factory=LoopSettings)
+    mirror: MirrorSettings = Field(default_factory=MirrorSettings)
     simulation: SimulationSettings = Field(default_factory=SimulationSettings)
 
     @model_validator(mode="after")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
 
-_OF_A_SEQUENCE = ("layer_fractions", "wind_speeds_m_per_s", "wind_directions_deg", "screen_width_m")
+_OF_A_SEQUENCE = ("layer_fractions", "wind_speeds_m_per_s", "wind_directions_deg", "screen_width_m", "photons_per_s")
 
 
 class AtmosphereSettings(BaseModel):
@@ -17,6 +17,12 @@ class AtmosphereSettings(BaseModel):
         default=2e4,
         gt=0,
         description="photons that the whole sensor gets in one exposure, shared by its planes",
+    )
+    photons_per_s: float | None = Field(
+        default=None,
+        gt=0,
+        examples=[3e6],
+        description="photons that the whole sensor gets in a second of a loop; when given it rules instead of photons",
     )
     seeing_arcsec: float = Field(
         default=0.6, gt=0, le=10, description="full width at half maximum of a long exposure at 0.5 um"

@@ -178,6 +178,10 @@ class ExposureSimulator(eqx.Module):
         lit = light > SMALLEST_LIGHT * jnp.max(light)
         return jnp.where(lit, weighted / jnp.where(lit, light, 1), jnp.nan)
 
+    def pixel_weights(self) -> Float[Array, "y x"]:
+        """Share of the pupil's light on every detector pixel."""
+        return integrate_on_pixels(self.weights[None], factor=self.factor, window=self.window)[0]
+
     def on_light(self, opd_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "Y X"]:
         """A wavefront on the part of the grid that holds the pupil, zero around it."""
         margins = [((whole - part) // 2,) * 2 for whole, part in zip(self.light.shape, opd_m.shape, strict=True)]

@@ -1,0 +1,153 @@
+"""The closed loop: a step for every exposure, a line for every stage of the light."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.modes import ModalBasis, modal_basis
+from nlcwfs.config import Config
+from nlcwfs.errors import SettingsError
+from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.feedback.controller import Controller
+from nlcwfs.feedback.state import FeedbackState
+from nlcwfs.science.long_exposure import LongExposure
+from nlcwfs.science.rms_groups import rms_groups
+from nlcwfs.simulation.exposure import Exposure
+from nlcwfs.simulation.loop_faults import bump_m, damaged, fault_in
+from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.loop_measurement import Measurement, Sight, build_measurement
+
+GROUPS = ("tip_tilt", "low", "middle", "high", "beyond")
+"""Groups of modes in the order of `Record.group_nm2`: tilt, below 4 cycles per aperture, 4 to 12, above, the rest."""
+
+
+class LoopState(NamedTuple):
+    """What is carried from exposure to exposure.
+
+    Attributes:
+        frame: Number of the next exposure.
+        control: The controller's, the mirror included.
+        memory: The reconstructor's.
+        image: The star's image since the loop settled.
+        closed_at: Frame at which the loop closed; -1 before.
+        before: The exposure that arrived last; for a detector that sends it twice.
+    """
+
+    frame: int
+    control: FeedbackState
+    memory: Any
+    image: LongExposure
+    closed_at: int
+    before: Exposure | None
+
+
+class Record(NamedTuple):
+    """What is recorded of an exposure.
+
+    Attributes:
+        rms_nm: Residual, mean over the moments of the exposure.
+        group_nm2: Squares of the residual by groups of modes, see `GROUPS`; of the mean over detector pixels.
+        sight: What was measured; None of an exposure that did not arrive.
+        command_m: Mean command that was on the mirror.
+    """
+
+    rms_nm: float
+    group_nm2: Float[np.ndarray, "5"]
+    sight: Sight | None
+    command_m: Float[np.ndarray, " mode"]
+
+
+class Loop:
+    """A loop, ready to run.
+
+    Attributes:
+        config: The settings.
+        light: Air, mirror, optics, detector and star.
+        measurement: Sensor and reconstructor.
+        controller: From measurements to commands.
+        basis: Modes on the detector's pixels, for the groups.
+    """
+
+    def __init__(self, config: Config, *, light: LoopLight, measurement: Measurement, controller: Controller) -> None:
+        self.config, self.light, self.measurement, self.controller = config, light, measurement, controller
+        self.basis = pixel_basis(light)
+        self._groups = jax.jit(self._group_squares)
+
+    @classmethod
+    def build(cls, config: Config) -> "Loop":
+        """Prepare everything.
+
+        Raises:
+            SettingsError: If settings contradict each other.
+            SamplingError: If the pupil does not fit in the window, or the mirror's shapes are too fine.
+        """
+        most = config.loop.substeps * config.loop.rate_hz
+        blur_m = max(config.atmosphere.wind_speeds_m_per_s) / most
+        if blur_m > config.beam.diameter_m / 4:
+            rule = "must be higher, or loop.substeps: the air moves more than a quarter of the telescope in a moment"
+            raise SettingsError("loop.rate_hz", rule, f"{config.loop.rate_hz:g}")
+        light = LoopLight.build(config)
+        controller = Controller.build(config.feedback, light.mirror.count, config.loop.rate_hz)
+        return cls(config, light=light, measurement=build_measurement(config, light), controller=controller)
+
+    def init(self) -> LoopState:
+        """Before the first exposure: the mirror flat, or with the shape of the air."""
+        control = self.controller.init()
+        if self.config.loop.start == "closed":
+            command_m = self.light.mirror.fitted(self.light.air_m(0))
+            for _ in range(control.line.commands_m.shape[0]):
+                control = control.push(command_m)
+        image = self.light.star_image(self.config.loop.science_wavelength_um * 1e-6)
+        return LoopState(0, control, None, image, -1, None)
+
+    def step(self, state: LoopState) -> tuple[LoopState, Record]:
+        """One exposure: air, mirror, light, detector, wavefront, command."""
+        light, settings, line = self.light, self.config.loop, state.control.line
+        fault = fault_in(settings, state.frame)
+        bump = bump_m(settings, light, state.frame)
+        corrected = light.expose(jnp.asarray(state.frame, jnp.int32), line, state.image, bump)
+        arrived = damaged(fault, corrected.exposure, state.before)
+        sight, memory, control = None, state.memory, None
+        if arrived is not None:
+            sight, memory = self._measured(arrived, line.mean_m, state.memory)
+            if sight.outcome not in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+                control, _ = self.controller.step(state.control, sight.residual_m)
+        if control is None:
+            control, _ = self.controller.skip(state.control)
+        closed_at = state.closed_at
+        if closed_at < 0 and sight is not None and sight.closed:
+            closed_at = state.frame
+        image = corrected.image
+        if closed_at < 0 or state.frame <= closed_at + settings.settle_s * settings.rate_hz:
+            image = state.image  # nothing counts before the loop has settled
+        record = Record(
+            rms_nm=1e9 * float(jnp.sqrt(corrected.square_m2)),
+            group_nm2=1e18 * np.asarray(self._groups(corrected.exposure.truth_m), float),
+            sight=sight,
+            command_m=np.asarray(line.mean_m),
+        )
+        return LoopState(state.frame + 1, control, memory, image, closed_at, corrected.exposure), record
+
+    def _measured(self, arrived: Exposure, command_m: Float[Array, " mode"], memory: Any) -> tuple[Sight, Any]:
+        electrons = arrived.frames.electrons - self.light.still.detector.background_electrons
+        usable = jnp.isfinite(electrons)
+        clean = arrived._replace_electrons(jnp.where(usable, electrons, 0))
+        return self.measurement.measure(clean, usable, self.light.mirror.opd_m(command_m), memory)
+
+    def _group_squares(self, truth_m: Float[Array, "y x"]) -> Float[Array, "5"]:
+        groups = rms_groups(jnp.nan_to_num(truth_m), self.basis, grid=self.light.still.frame)
+        return jnp.stack([getattr(groups, f"{name}_m") for name in GROUPS]) ** 2
+
+
+def pixel_basis(light: LoopLight) -> ModalBasis:
+    """Karhunen-Loeve modes on the detector's pixels, as many as the mirror has, or as the pixels carry."""
+    still = light.still
+    frame: Grid = still.frame
+    pupil = still.shape.on(frame)
+    lit = int(np.sum(pupil > 0.5))
+    count = min(light.mirror.count, int(0.45 * lit))
+    return modal_basis(pupil, frame, diameter_m=still.shape.diameter_m, count=count)

@@ -1,0 +1,49 @@
+"""What may go wrong in a loop: frames that are damaged, missing or old, and a bump in the wavefront."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nlcwfs.simulation.exposure import Exposure
+from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.loop_settings import LoopSettings
+
+
+def fault_in(settings: LoopSettings, frame: int) -> str:
+    """The fault of a frame, or `none`.
+
+    Examples:
+        >>> settings = LoopSettings(rate_hz=100, fault="lost", fault_at_s=0.1, fault_s=0.02)
+        >>> [fault_in(settings, frame) for frame in (9, 10, 11, 12)]
+        ['none', 'lost', 'lost', 'none']
+    """
+    first = round(settings.fault_at_s * settings.rate_hz)
+    last = first + max(1, round(settings.fault_s * settings.rate_hz))
+    return settings.fault if first <= frame < last else "none"
+
+
+def bump_m(settings: LoopSettings, light: LoopLight, frame: int) -> Float[Array, "lit_y lit_x"]:
+    """The bump's wavefront in a frame: smooth noise of the given rms from its beginning on, else nothing."""
+    flat = jnp.zeros_like(light.weights)
+    if settings.fault != "bump" or frame < round(settings.fault_at_s * settings.rate_hz):
+        return flat
+    commands = jax.random.normal(jax.random.key(7), (min(60, light.mirror.count),), flat.dtype)
+    shape_m = light.mirror.opd_m(jnp.zeros(light.mirror.count, flat.dtype).at[: commands.size].set(commands) * 1e-9)
+    rms_m = jnp.sqrt(jnp.sum(light.weights * shape_m**2))
+    return shape_m * (settings.bump_nm * 1e-9 / rms_m)
+
+
+def damaged(fault: str, exposure: Exposure, before: Exposure | None) -> Exposure | None:
+    """What arrives of an exposure; nothing when it is lost."""
+    electrons = exposure.frames.electrons
+    if fault == "lost":
+        return None
+    if fault == "doubled" and before is not None:
+        return before
+    if fault == "nan":
+        electrons = jnp.full_like(electrons, np.nan)
+    if fault == "dead-plane":
+        electrons = electrons.at[0].set(0)
+    return eqx.tree_at(lambda one: one.frames.electrons, exposure, electrons)

@@ -1,0 +1,143 @@
+"""What the sensor and the astronomer get while a mirror follows moving air."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nlcwfs.beam.grid import Grid
+from nlcwfs.config import Config
+from nlcwfs.feedback.delay_line import DelayLine
+from nlcwfs.mirror.mirror import Mirror
+from nlcwfs.science.long_exposure import LongExposure
+from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
+from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
+
+SHOWN_CYCLES = 40.0
+"""Half width of the star's image in lambda / D."""
+
+IMAGE_PIXELS = 161
+"""Pixels along a side of the star's image: two for each lambda / D."""
+
+
+class Corrected(eqx.Module):
+    """One exposure behind the mirror.
+
+    Attributes:
+        exposure: What the sensor's detector read; its wavefront is the mean residual.
+        square_m2: Mean over the moments of the residual's variance over the pupil.
+        image: The star's image so far.
+    """
+
+    exposure: Exposure
+    square_m2: Float[Array, ""]
+    image: LongExposure
+
+
+class LoopLight(eqx.Module):
+    """Air that moves, a mirror that is told, and the light behind both.
+
+    Attributes:
+        sequence: The air, the sensor's optics and its detector.
+        mirror: On the part of the light's grid that holds the pupil.
+        weights: Share of the light there.
+    """
+
+    sequence: SequenceSimulator
+    mirror: Mirror
+    weights: Float[Array, "lit_y lit_x"]
+
+    @classmethod
+    def build(cls, config: Config) -> "LoopLight":
+        """Draw the air and make the mirror.
+
+        Raises:
+            SettingsError: If settings contradict each other, or the air would repeat before the end.
+            SamplingError: If the pupil does not fit in the window, or the mirror's shapes are too fine for the light.
+        """
+        sequence = SequenceSimulator.build(sequence_config(config))
+        still = sequence.still
+        cut = still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]
+        pupil, part = _middle(still.shape.on(still.light), cut), Grid(cut, still.light.pixel_m)
+        diameter_m = config.beam.diameter_m
+        dtype = str(still.weights.dtype)
+        mirror = Mirror.build(config.mirror, pupil, part, diameter_m=diameter_m, dtype=dtype)
+        weights = _middle(np.asarray(still.weights, float), cut)
+        return cls(sequence=sequence, mirror=mirror, weights=jnp.asarray(weights, dtype))
+
+    @property
+    def still(self) -> ExposureSimulator:
+        """The optics."""
+        return self.sequence.still
+
+    def star_image(self, wavelength_m: float) -> LongExposure:
+        """An image to which nothing has been added yet."""
+        still = self.still
+        angles = Grid((IMAGE_PIXELS, IMAGE_PIXELS), wavelength_m / still.shape.diameter_m / 2)
+        pupil = _middle(still.shape.on(still.light), self.weights.shape)
+        return LongExposure.init(pupil, wavelength_m=wavelength_m, pixel_m=still.light.pixel_m, angles=angles)
+
+    def air_m(self, frame: int) -> Float[Array, "lit_y lit_x"]:
+        """The wavefront of the air in the middle of an exposure, without piston."""
+        moment_s = jnp.asarray((frame + 0.5) / self.sequence.rate_hz, self.weights.dtype)
+        opd_m = self.sequence.flow.opd_m(moment_s)
+        return opd_m - jnp.sum(self.weights * opd_m)
+
+    @eqx.filter_jit
+    def expose(
+        self, frame: Int[Array, ""], line: DelayLine, image: LongExposure, bump_m: Float[Array, "lit_y lit_x"]
+    ) -> Corrected:
+        """One exposure. A moment in which the mirror changes sees the mean of both shapes.
+
+        Args:
+            frame: Its number; frame 0 begins at 0.
+            line: The mirror during the exposure.
+            image: The star's image so far.
+            bump_m: Wavefront in addition to that of the air.
+        """
+        still, share = self.still, 1 / self.sequence.substeps
+        moments_s = self.sequence.moments_s(frame)
+        after_m = self.mirror.opd_m(line.after_m)
+        before_m = self.mirror.opd_m(line.before_m) if line.share_before > 0 else after_m
+
+        def add(sums: tuple, moment: tuple[Array, Array]) -> tuple[tuple, None]:
+            opd_m = self.sequence.flow.opd_m(moment[0]) + bump_m - moment[1] * before_m - (1 - moment[1]) * after_m
+            opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
+            whole_m = still.on_light(opd_m)
+            planes = still.sensor.images(whole_m, share * still.photons).photons
+            square = jnp.sum(self.weights * opd_m**2)
+            return (sums[0] + whole_m * share, sums[1] + planes, sums[2] + square * share, sums[3].add(opd_m)), None
+
+        shape, dtype = still.sensor.transfer.shape[1:], still.weights.dtype
+        none = (jnp.zeros(shape[1:], dtype), jnp.zeros(shape, dtype), jnp.zeros((), dtype), image)
+        early = self._share_before(line.share_before)
+        (opd_m, planes, square, image), _ = jax.lax.scan(add, none, (moments_s, early))
+        key = jax.random.split(jax.random.fold_in(jax.random.key(self.sequence.seed), frame))[1]
+        return Corrected(still.read(opd_m, planes, key), square, image)
+
+    def _share_before(self, share: float) -> Float[Array, " substep"]:
+        """For each moment, the part of its time with the earlier command on the mirror."""
+        begins = np.arange(self.sequence.substeps) / self.sequence.substeps
+        return jnp.asarray(np.clip((share - begins) * self.sequence.substeps, 0, 1), self.weights.dtype)
+
+
+def sequence_config(config: Config) -> Config:
+    """The same, as the sequence that a loop exposes: its rate, its length, its light, and air that lasts."""
+    loop, sky = config.loop, config.atmosphere
+    photons = sky.photons if sky.photons_per_s is None else sky.photons_per_s / loop.rate_hz
+    carried_m = max(sky.wind_speeds_m_per_s) * loop.seconds
+    width_m = max(SCREEN_DIAMETERS * config.beam.diameter_m, carried_m + 4 * config.beam.diameter_m)
+    air = {"photons": photons, "screen_width_m": sky.screen_width_m or width_m}
+    time = {"rate_hz": loop.rate_hz, "frames": loop.frames, "substeps": loop.substeps}
+    return config.model_copy(
+        update={
+            "atmosphere": sky.model_copy(update=air),
+            "simulation": config.simulation.model_copy(update=time),
+        }
+    )
+
+
+def _middle(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    corner = [(whole - part) // 2 for whole, part in zip(array.shape, shape, strict=True)]
+    return array[corner[0] : corner[0] + shape[0], corner[1] : corner[1] + shape[1]]

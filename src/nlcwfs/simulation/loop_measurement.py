@@ -1,0 +1,321 @@
+"""What a sensor and its reconstructor make of an exposure in a loop: coefficients of the mirror's modes."""
+
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Array, Bool, Float
+
+from nlcwfs.beam.modes import modal_basis
+from nlcwfs.config import Config
+from nlcwfs.estimation.method import Reconstructor, build_reconstructor
+from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.sequence_memory import Memory
+from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
+from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+from nlcwfs.simulation.exposure import Exposure, distances_m, wavelength_m
+from nlcwfs.simulation.loop_light import LoopLight
+
+DOUBTS = 2
+"""Frames in a row that are not explained before what was followed is given up."""
+
+WORTH_FITTING = 0.02
+"""Combinations of modes that the pixels show less than this part of the clearest are left alone."""
+
+
+class Sight(NamedTuple):
+    """What was measured in one exposure.
+
+    Attributes:
+        residual_m: Of each mode of the mirror.
+        outcome: How the reconstruction ended.
+        predicted_m: Rms error that it expects of itself.
+        ffts: Two-dimensional FFTs of one plane that it took.
+        closed: Whether the frame was followed from the one before.
+    """
+
+    residual_m: Float[Array, " mode"]
+    outcome: Outcome
+    predicted_m: float
+    ffts: int
+    closed: bool
+
+
+class Measurement(Protocol):
+    """A sensor with its reconstructor; `memory` is its own, None before the first exposure."""
+
+    def measure(
+        self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: Any
+    ) -> tuple[Sight, Any]:
+        """What an exposure shows, with the mean shape of the mirror over it."""
+        ...
+
+
+class PixelModes(eqx.Module):
+    """From a wavefront on the detector's pixels to commands of the mirror, by least squares over the light."""
+
+    fit: Float[Array, "mode y x"]
+
+    @classmethod
+    def build(cls, light: LoopLight) -> "PixelModes":
+        """Average the mirror's shapes over pixels, and invert."""
+        still, mirror = light.still, light.mirror
+        weights = np.nan_to_num(np.asarray(still.pixel_weights(), float))
+        lit = weights > 0
+        root = np.sqrt(weights[lit])
+        on_pixels = eqx.filter_jit(lambda shape: still.on_pixels(still.on_light(shape)))
+        shapes = np.stack([np.asarray(on_pixels(mirror.opd_m(row)))[lit] for row in _unit_commands(mirror.count)])
+        tall = (np.nan_to_num(shapes) / UNIT_M * root).T
+        left, size, right = np.linalg.svd(tall - root[:, None] * (root @ tall)[None], full_matrices=False)
+        kept = size > WORTH_FITTING * size[0]
+        fit = np.zeros((mirror.count, *weights.shape))
+        fit[:, lit] = (right[kept].T / size[kept]) @ left[:, kept].T * root
+        return cls(jnp.asarray(fit, str(still.weights.dtype)))
+
+    def __call__(self, opd_m: Float[Array, "y x"]) -> Float[Array, " mode"]:
+        """The command that comes closest to a wavefront."""
+        return jnp.tensordot(self.fit, jnp.nan_to_num(opd_m).astype(self.fit.dtype), axes=2)
+
+
+UNIT_M = 1e-9
+"""Size of the commands by which the mirror's shapes are seen: far from any stroke."""
+
+
+def _unit_commands(count: int) -> Float[np.ndarray, "mode mode"]:
+    return UNIT_M * np.eye(count)
+
+
+class Cautious(eqx.Module):
+    """Less of a wavefront that is not believed: its fine waves may be islands that are a turn off.
+
+    Attributes:
+        kept: Share of each mode.
+    """
+
+    kept: Float[Array, " mode"]
+
+    @classmethod
+    def build(cls, config: Config, cycles_per_aperture: Float[np.ndarray, " mode"]) -> "Cautious":
+        """Shares that fall from the capture gain to nothing beyond the capture cutoff."""
+        kept = config.loop.capture_gain * np.exp(-((np.asarray(cycles_per_aperture) / config.loop.capture_cpa) ** 4))
+        return cls(jnp.asarray(kept, jnp.float32))
+
+    def part(self, residual_m: Float[Array, " mode"], outcome: Outcome) -> Float[Array, " mode"]:
+        """What the mirror should take out."""
+        if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+            return jnp.zeros_like(residual_m)
+        return residual_m if outcome.succeeded else residual_m * self.kept.astype(residual_m.dtype)
+
+
+class FollowedState(NamedTuple):
+    """Memory of a loop that is followed.
+
+    Attributes:
+        memory: What is expected; None while the loop is not closed.
+        doubts: Frames in a row that were not explained.
+        since: Frames since the last second look.
+    """
+
+    memory: Memory | None
+    doubts: int
+    since: int
+
+
+class FollowedCurvature(eqx.Module):
+    """The curvature sensor with the most likely wavefront, followed from frame to frame.
+
+    While the loop is open each frame is reconstructed on its own, for the whole turbulence: air and mirror together
+    are Kolmogorov's, not the residual. Once a wavefront is believed the next are followed with a fixed number of FFTs.
+    """
+
+    reconstructor: SequenceReconstructor
+    pixels: PixelModes
+    cautious: Cautious
+    corner: tuple[int, int] = eqx.field(static=True)
+    nearest: tuple[np.ndarray, np.ndarray]
+    coarser: int = eqx.field(static=True)
+    read_variance: float = eqx.field(static=True)
+    look_again_every: int = eqx.field(static=True)
+    weights: Float[Array, "Y X"]
+
+    @classmethod
+    def build(cls, config: Config, light: LoopLight) -> "FollowedCurvature":
+        """Prepare the reconstructor of a configuration.
+
+        Raises:
+            SettingsError: If settings contradict each other.
+        """
+        still, geometry = light.still, loop_geometry(config, light)
+        settings = config.estimation
+        if settings.prior.wind_speed_m_per_s == type(settings.prior)().wind_speed_m_per_s:
+            speed = max(config.atmosphere.wind_speeds_m_per_s)
+            prior = settings.prior.model_copy(update={"wind_speed_m_per_s": speed})
+            settings = settings.model_copy(update={"prior": prior})
+        rate_hz = light.sequence.rate_hz
+        sequence = SequenceReconstructor.build(geometry, settings, interval_s=1 / rate_hz, photons=still.photons)
+        level = sequence.solver.level
+        coarser = still.factor // level.oversampling
+        lit = np.asarray(level.light) > 0
+        nearest = scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
+        corner = [(a * coarser - b) // 2 for a, b in zip(level.grid.shape, light.weights.shape, strict=True)]
+        camera = config.detector
+        return cls(
+            reconstructor=sequence,
+            pixels=PixelModes.build(light),
+            cautious=Cautious.build(config, light.mirror.cycles_per_aperture),
+            corner=(corner[0], corner[1]),
+            nearest=(nearest[0], nearest[1]),
+            coarser=coarser,
+            read_variance=camera.read_noise_electrons**2 / camera.em_gain**2 + still.detector.background_electrons,
+            look_again_every=config.loop.look_again_every,
+            weights=light.weights,
+        )
+
+    def on_model(self, mirror_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "y x"]:
+        """A shape of the mirror on the model's grid, continued beyond the rim as it is there."""
+        margins = [(corner, corner) for corner in self.corner]
+        both = jnp.stack([jnp.pad(self.weights * mirror_m, margins), jnp.pad(self.weights, margins)])
+        rows, columns = (size // self.coarser for size in both.shape[1:])
+        summed = both.reshape(2, rows, self.coarser, columns, self.coarser).sum(axis=(2, 4))
+        mean_m = jnp.where(summed[1] > 0, summed[0] / jnp.where(summed[1] > 0, summed[1], 1), 0)
+        return mean_m[self.nearest[0], self.nearest[1]]
+
+    @eqx.filter_jit
+    def _started(
+        self, counts: Array, usable: Array, mirror_m: Array
+    ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
+        known_m, noise = -self.on_model(mirror_m), self.read_variance
+        estimate, memory = self.reconstructor.start(counts, usable, read_variance=noise, known_m=known_m)
+        return estimate, memory, self.pixels(estimate.opd_m)
+
+    @eqx.filter_jit
+    def _followed(
+        self, counts: Array, usable: Array, mirror_m: Array, memory: Memory
+    ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
+        known_m, noise = -self.on_model(mirror_m), self.read_variance
+        estimate, memory = self.reconstructor.follow(counts, usable, memory, read_variance=noise, known_m=known_m)
+        return estimate, memory, self.pixels(estimate.opd_m)
+
+    @eqx.filter_jit
+    def _again(
+        self, counts: Array, usable: Array, mirror_m: Array, memory: Memory
+    ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
+        known_m, noise = -self.on_model(mirror_m), self.read_variance
+        estimate, memory = self.reconstructor.look_again(counts, usable, memory, read_variance=noise, known_m=known_m)
+        return estimate, memory, self.pixels(estimate.opd_m)
+
+    def measure(
+        self,
+        exposure: Exposure,
+        usable: Bool[Array, "plane y x"],
+        mirror_m: Float[Array, "lit_y lit_x"],
+        memory: FollowedState | None,
+    ) -> tuple[Sight, FollowedState]:
+        """See `Measurement`."""
+        state = memory or FollowedState(None, 0, 0)
+        counts = exposure.frames.electrons
+        if state.memory is None:
+            estimate, begun, residual_m = self._started(counts, usable, mirror_m)
+            outcome = Outcome(int(estimate.outcome_code))
+            after = FollowedState(begun if outcome.succeeded else None, 0, 0)
+            return self._sight(estimate, residual_m, outcome, closed=False), after
+        estimate, followed, residual_m = self._followed(counts, usable, mirror_m, state.memory)
+        outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
+        doubts = 0 if outcome.succeeded else state.doubts + 1
+        since = state.since + 1
+        if outcome.succeeded and self.look_again_every and since >= self.look_again_every:
+            again, followed, residual_m = self._again(counts, usable, mirror_m, followed)
+            ffts, since = ffts + int(again.ffts), 0
+        if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+            followed = self.reconstructor.skip(state.memory)
+        sight = self._sight(estimate, residual_m, outcome, closed=True)._replace(ffts=ffts)
+        return sight, FollowedState(None if doubts >= DOUBTS else followed, doubts, since)
+
+    def _sight(self, estimate: WavefrontEstimate, residual_m: Array, outcome: Outcome, *, closed: bool) -> Sight:
+        part_m = self.cautious.part(residual_m, outcome)
+        return Sight(part_m, outcome, float(estimate.predicted_error_m), int(estimate.ffts), closed)
+
+
+class SingleFrames(eqx.Module):
+    """The curvature sensor with any method, every frame on its own."""
+
+    reconstructor: Reconstructor
+    pixels: PixelModes
+    cautious: Cautious
+    read_variance: float = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, config: Config, light: LoopLight) -> "SingleFrames":
+        """Prepare the reconstructor of a configuration.
+
+        Raises:
+            SettingsError: If settings contradict each other.
+        """
+        geometry, settings, basis = loop_geometry(config, light), config.estimation, None
+        if settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes":
+            pupil = geometry.pupil.on(geometry.frame)
+            basis = modal_basis(pupil, geometry.frame, diameter_m=geometry.pupil.diameter_m, count=settings.modes)
+        camera = config.detector
+        return cls(
+            reconstructor=build_reconstructor(geometry, settings, basis=basis),
+            pixels=PixelModes.build(light),
+            cautious=Cautious.build(config, light.mirror.cycles_per_aperture),
+            read_variance=camera.read_noise_electrons**2 / camera.em_gain**2
+            + light.still.detector.background_electrons,
+        )
+
+    @eqx.filter_jit
+    def _estimated(self, counts: Array, usable: Array) -> tuple[WavefrontEstimate, Float[Array, " mode"]]:
+        estimate = self.reconstructor.estimate(counts, usable, read_variance=self.read_variance)
+        return estimate, self.pixels(estimate.opd_m)
+
+    def measure(
+        self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
+    ) -> tuple[Sight, None]:
+        """See `Measurement`."""
+        estimate, residual_m = self._estimated(exposure.frames.electrons, usable)
+        outcome = Outcome(int(estimate.outcome_code))
+        part_m = self.cautious.part(residual_m, outcome)
+        return Sight(part_m, outcome, float(estimate.predicted_error_m), int(estimate.ffts), outcome.succeeded), None
+
+
+class IdealMeasurement(eqx.Module):
+    """Sees the mean residual of an exposure without noise: what lag and the mirror alone leave."""
+
+    light: LoopLight
+
+    def measure(
+        self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
+    ) -> tuple[Sight, None]:
+        """See `Measurement`."""
+        margins = [(a - b) // 2 for a, b in zip(exposure.opd_m.shape, mirror_m.shape, strict=True)]
+        inner = tuple(slice(m, m + size) for m, size in zip(margins, mirror_m.shape, strict=True))
+        residual_m = self.light.mirror.fitted(exposure.opd_m[inner])
+        return Sight(residual_m, Outcome.CONVERGED, 0.0, 0, True), None
+
+
+def build_measurement(config: Config, light: LoopLight) -> FollowedCurvature | SingleFrames | IdealMeasurement:
+    """The sensor and method that a configuration names.
+
+    Raises:
+        SettingsError: If settings contradict each other.
+    """
+    if config.loop.sensor == "ideal":
+        return IdealMeasurement(light)
+    if config.estimation.method == "map" and config.loop.follow:
+        return FollowedCurvature.build(config, light)
+    return SingleFrames.build(config, light)
+
+
+def loop_geometry(config: Config, light: LoopLight) -> SensorGeometry:
+    """What the reconstructor knows of the sensor."""
+    return SensorGeometry(
+        pupil=light.still.shape,
+        frame=light.still.frame,
+        wavelength_m=wavelength_m(config),
+        distances_m=distances_m(config),
+        flux_fractions=config.curvature_sensor.flux_fractions,
+    )
