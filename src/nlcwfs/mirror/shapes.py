@@ -120,9 +120,7 @@ def fourier_shapes(settings: MirrorSettings, lit: Bool[np.ndarray, "y x"], grid:
     return np.hstack([ramps, waves])[:, : settings.modes], cycles[: settings.modes]
 
 
-def actuator_shapes(
-    settings: MirrorSettings, lit: Bool[np.ndarray, "y x"], grid: Grid, *, diameter_m: float
-) -> Shapes:
+def actuator_shapes(settings: MirrorSettings, lit: Bool[np.ndarray, "y x"], grid: Grid, *, diameter_m: float) -> Shapes:
     """Gaussians on a square grid of actuators, those that reach the light; row by row from the smallest y.
 
     Half a period over two pitches is the fastest that they can do: their cycles per aperture are all that number.
