@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -135,11 +136,11 @@ class Loop:
     def _measured(self, arrived: Exposure, command_m: Float[Array, " mode"], memory: Any) -> tuple[Sight, Any]:
         electrons = arrived.frames.electrons - self.light.still.detector.background_electrons
         usable = jnp.isfinite(electrons)
-        clean = arrived._replace_electrons(jnp.where(usable, electrons, 0))
+        clean = eqx.tree_at(lambda one: one.frames.electrons, arrived, jnp.where(usable, electrons, 0))
         return self.measurement.measure(clean, usable, self.light.mirror.opd_m(command_m), memory)
 
     def _group_squares(self, truth_m: Float[Array, "y x"]) -> Float[Array, "5"]:
-        groups = rms_groups(jnp.nan_to_num(truth_m), self.basis, grid=self.light.still.frame)
+        groups = rms_groups(jnp.nan_to_num(truth_m), self.basis)
         return jnp.stack([getattr(groups, f"{name}_m") for name in GROUPS]) ** 2
 
 

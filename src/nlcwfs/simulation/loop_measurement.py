@@ -22,6 +22,10 @@ from nlcwfs.simulation.loop_light import LoopLight
 DOUBTS = 2
 """Frames in a row that are not explained before what was followed is given up."""
 
+PATIENT = {"healings": 8, "healing_iterations": 15, "agreement": 0.4}
+"""At least so patient is the search while a loop is open, at D / r0 of 25 and more: with the defaults for single frames
+3 of 8 loops closed with islands that cost 50 nm and more, or not within 24 frames; so all closed within 12."""
+
 WORTH_FITTING = 0.02
 """Combinations of modes that the pixels show less than this part of the clearest are left alone."""
 
@@ -154,6 +158,13 @@ class FollowedCurvature(eqx.Module):
             speed = max(config.atmosphere.wind_speeds_m_per_s)
             prior = settings.prior.model_copy(update={"wind_speed_m_per_s": speed})
             settings = settings.model_copy(update={"prior": prior})
+        own = settings.map
+        patient = {
+            "healings": max(own.healings, PATIENT["healings"]),
+            "healing_iterations": max(own.healing_iterations, PATIENT["healing_iterations"]),
+            "agreement": min(own.agreement, PATIENT["agreement"]),
+        }
+        settings = settings.model_copy(update={"map": own.model_copy(update=patient)})
         rate_hz = light.sequence.rate_hz
         sequence = SequenceReconstructor.build(geometry, settings, interval_s=1 / rate_hz, photons=still.photons)
         level = sequence.solver.level
