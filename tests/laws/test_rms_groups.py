@@ -16,10 +16,8 @@ GRID = Grid((35, 39), 0.25)
 PUPIL = circular_pupil(GRID, diameter_m=8.0, obstruction_ratio=0.3)
 SEEN = np.where(PUPIL < 0.1, 0, PUPIL) ** 2
 WEIGHTS = SEEN / SEEN.sum()
-BASES = {
-    kind: modal_basis(PUPIL, GRID, diameter_m=8.0, count=400, kind=kind)
-    for kind in ("karhunen-loeve", "disc-harmonics")
-}
+KINDS = ("karhunen-loeve", "disc-harmonics")
+BASES = {kind: modal_basis(PUPIL, GRID, diameter_m=8.0, count=400, kind=kind) for kind in KINDS}
 NAMES = ("tip_tilt_m", "low_m", "middle_m", "high_m", "beyond_m")
 
 
@@ -31,7 +29,7 @@ def rms(opd_m):
 @settings(deadline=None, max_examples=30)
 @given(
     seed=st.integers(0, 2**31 - 1),
-    kind=st.sampled_from(list(BASES)),
+    kind=st.sampled_from(KINDS),
     piston_m=st.floats(-1e-6, 1e-6),
     slope=st.floats(-1e-6, 1e-6),
     edges=st.tuples(st.floats(0, 14), st.floats(0, 14)).map(sorted).map(tuple),
@@ -45,7 +43,7 @@ def test_the_squares_of_the_groups_add_up_to_the_square_of_the_whole(seed, kind,
 
 
 @settings(deadline=None, max_examples=20)
-@given(place=st.integers(2, 399), kind=st.sampled_from(list(BASES)))
+@given(place=st.integers(2, 399), kind=st.sampled_from(KINDS))
 def test_a_mode_falls_into_the_group_of_its_frequency(place, kind):
     basis = BASES[kind]
     cycles = basis.cycles_per_aperture[place]
@@ -57,7 +55,7 @@ def test_a_mode_falls_into_the_group_of_its_frequency(place, kind):
     assert max(found.values()) < 0.15 * 5e-8
 
 
-@pytest.mark.parametrize("kind", list(BASES))
+@pytest.mark.parametrize("kind", KINDS)
 def test_all_groups_are_there(kind):
     cycles = BASES[kind].cycles_per_aperture
     assert np.any(cycles < 4)
@@ -65,7 +63,7 @@ def test_all_groups_are_there(kind):
     assert np.any(cycles >= 12)
 
 
-@pytest.mark.parametrize("kind", list(BASES))
+@pytest.mark.parametrize("kind", KINDS)
 def test_ramps_are_tip_tilt_and_nothing_else(kind):
     ramp_m = 3e-8 * (GRID.x_m - 0.4 * GRID.y_m) + 5e-7
     groups = rms_groups(ramp_m, BASES[kind])
@@ -99,7 +97,5 @@ def test_single_precision_knows_a_nanometre():
 
 
 def test_edges_must_be_in_order():
-    with pytest.raises(
-        SettingsError, match=r"edges_cpa: must be two frequencies, the lower one first, got \(9.0, 2.0\)"
-    ):
+    with pytest.raises(SettingsError, match=r"edges_cpa: must be two frequencies, .* first, got \(9.0, 2.0\)"):
         rms_groups(np.zeros(GRID.shape), BASES["karhunen-loeve"], edges_cpa=(9.0, 2.0))

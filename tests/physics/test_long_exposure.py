@@ -146,7 +146,7 @@ def test_what_does_not_fit_in_the_window_is_refused(perfect):
         encircled_energy(perfect.image, SKY, radius_rad=12 * RESOLUTION_RAD)
     with pytest.raises(SamplingError, match=r"fraction: must be at most 0\.9.*, what the window holds, got 0.999"):
         energy_radius(perfect.image, SKY, fraction=0.999, total=float(perfect.total))
-    with pytest.raises(SettingsError, match="fraction: must be between 0 and 1, got 1.5"):
+    with pytest.raises(SettingsError, match=r"fraction: must be between 0 and 1, got 1\.5"):
         energy_radius(perfect.image, SKY, fraction=1.5)
     with pytest.raises(SettingsError, match="image: must hold light"):
         encircled_energy(np.zeros(SKY.shape), SKY, radius_rad=RESOLUTION_RAD)

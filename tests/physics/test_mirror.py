@@ -87,7 +87,7 @@ def test_ideal_modes_up_to_a_cutoff_leave_the_spectrum_beyond_it(screens):
 
 @pytest.mark.parametrize("across", [9, 17])
 def test_gaussian_actuators_leave_the_usual_share_of_a_pitch(screens, across):
-    """0.23 to 0.35 (d / r0)^(5/3) for a pitch d (Hudgin 1977, JOSA 67, 393; Hardy 1998, table 6.1)."""
+    """0.23 to 0.35 (d / r0)^(5/3) for a pitch d (Hudgin 1977, JOSA 67, 393)."""
     mirror = built(kind="actuators", actuators_across=across)
     left, doubt = left_rad2(mirror, screens)
     left += beyond_pixels_rad2(GRID.pixel_m / DIAMETER_M)

@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.pupil import Spiders, circular_pupil
+from nlcwfs.beam.modes import modal_basis
+from nlcwfs.beam.pupil import Spiders, circular_pupil, pupil_of_discs
 from nlcwfs.beam.zernike import zernike
 from nlcwfs.config_messages import problems_in_words
 from nlcwfs.errors import SamplingError, SettingsError
@@ -225,6 +226,19 @@ def test_bad_settings_give_one_clear_line(values, line):
 def test_shapes_too_fine_for_the_pixels_are_refused(settings, message):
     with pytest.raises(SamplingError, match=message):
         Mirror.build(settings, PUPIL, GRID, diameter_m=DIAMETER_M)
+
+
+def test_a_sparse_pupil_has_all_its_modes_up_to_the_cutoff():
+    """Four discs have fewer modes than one; their number must not hang on how many were made beyond them."""
+    centres_m = [(2.4, 1.1), (-1.1, 2.4), (-2.4, -1.1), (1.1, -2.4)]
+    pupil = pupil_of_discs(GRID, centres_m=centres_m, disc_diameter_m=2.4)
+    many = modal_basis(pupil, GRID, diameter_m=DIAMETER_M, count=300)
+    for cutoff in (4.0, 8.0, 12.0):
+        mirror = Mirror.build(MirrorSettings(cutoff_cpa=cutoff), pupil, GRID, diameter_m=DIAMETER_M)
+        assert mirror.cycles_per_aperture.max() <= cutoff
+        assert mirror.count == pytest.approx(int(np.sum(many.cycles_per_aperture <= cutoff)), rel=0.03)
+    with pytest.raises(SamplingError, match=r"mirror.cutoff_cpa: must be lower, .* got 18\.1"):
+        Mirror.build(MirrorSettings(cutoff_cpa=18.1), pupil, GRID, diameter_m=DIAMETER_M)
 
 
 def test_a_diameter_must_be_a_length():

@@ -1,5 +1,7 @@
 """Stars in photons a second, against numbers worked out by hand and those of the field."""
 
+import itertools
+
 import pytest
 
 from nlcwfs.atmosphere.star import BANDS, collecting_area_m2, photons_per_s
@@ -36,7 +38,7 @@ def test_zero_points_per_frequency_and_per_wavelength_agree(band):
 def test_bands_follow_each_other_and_do_not_lie_within_each_other():
     assert "".join(BANDS) == "UBVRIJHK"
     bands = list(BANDS.values())
-    for blue, red in zip(bands, bands[1:], strict=False):
+    for blue, red in itertools.pairwise(bands):
         assert blue.wavelength_um < red.wavelength_um
         assert red.wavelength_um - blue.wavelength_um > 0.6 * (blue.width_um + red.width_um) / 2
 

@@ -1,14 +1,13 @@
 """A mirror that adds the shapes it knows, each as far as it is commanded."""
 
 import math
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import DIM
@@ -169,10 +168,10 @@ def _least_squares(
     return inverse @ weighted, float(np.sqrt(strength[-1] / strength[keep][0])), int(keep.sum())
 
 
-def _nearest(bright: Any) -> Int[np.ndarray, "y x"]:
+def _nearest(bright: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
     """For every pixel the number of the bright one that is nearest, counted along the rows."""
     number = np.cumsum(bright).reshape(bright.shape) - 1
-    row, column = scipy.ndimage.distance_transform_edt(~bright, return_distances=False, return_indices=True)
+    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~bright, return_distances=False, return_indices=True))
     return number[row, column]
 
 

@@ -97,7 +97,9 @@ def energy_radius(
         return encircled_energy(image, angles, radius_rad=radius_rad, total=total) - fraction
 
     least = largest * 1e-6
-    return least if excess(least) >= 0 else float(scipy.optimize.brentq(excess, least, largest, xtol=least))
+    if excess(least) >= 0:
+        return least
+    return scipy.optimize.root_scalar(excess, bracket=(least, largest), method="brentq", xtol=least).root
 
 
 def full_width_half_maximum(image: Float[Array, "v u"] | Float[np.ndarray, "v u"], angles: Grid) -> float:
