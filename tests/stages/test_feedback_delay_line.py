@@ -10,7 +10,7 @@ SUBSTEPS = 10  # of an exposure; every latency below is a whole number of them
 
 
 def mirror_in_time(commands: np.ndarray, latency_frames: float) -> np.ndarray:
-    """Shape `[exposure, substep, mode]` of a mirror whose command n arrives `latency_frames` after exposure n begins."""
+    """Shape `[exposure, substep, mode]`; command n arrives `latency_frames` after exposure n begins."""
     exposures = len(commands)
     shape = np.zeros((exposures * SUBSTEPS, commands.shape[1]))
     for number, command in enumerate(commands):

@@ -1,32 +1,14 @@
 """The integrator does what its difference equation says, and is refused where that diverges."""
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from feedback_loops import closed_loop
 from scipy.signal import lfilter
 
 from nlcwfs.errors import SettingsError
 from nlcwfs.feedback.integrator import Integrator, largest_stable_gain
 from nlcwfs.feedback.loop_transfer import IntegratorLoop
-
-
-def closed_loop(controller, air_m: np.ndarray, noise_m: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Mean residuals `[exposure, mode]` and commands of a loop whose mirror does what it is told."""
-    noise_m = np.zeros_like(air_m) if noise_m is None else noise_m
-
-    def expose(state, moment):
-        residual_m = moment[0] - state.line.mean_m
-        state, command_m = controller.step(state, residual_m + moment[1])
-        return state, (residual_m, command_m)
-
-    _, recorded = eqx.filter_jit(lambda air, noise: jax.lax.scan(expose, controller.init(), (air, noise)))(
-        jnp.asarray(air_m), jnp.asarray(noise_m)
-    )
-    return np.asarray(recorded[0]), np.asarray(recorded[1])
 
 
 def integrator(*gains: float, latency_frames: float = 0.0, leak: float = 1.0, pseudo_open_loop: bool = False):
@@ -134,30 +116,7 @@ def test_an_unstable_gain_is_refused_and_the_way_out_is_named():
     integrator(1.0, latency_frames=1.0, pseudo_open_loop=True)
 
 
-# ------------------------------------------------------------------------------------------------- the step
-
-
-@settings(deadline=None, max_examples=30)
-@given(
-    seed=st.integers(0, 2**31),
-    factors=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
-    latency_frames=st.sampled_from([0.0, 0.4, 2.5]),
-    pseudo_open_loop=st.booleans(),
-)
-def test_a_step_is_linear(seed, factors, latency_frames, pseudo_open_loop):
-    controller = integrator(0.2, 0.35, 0.3, latency_frames=latency_frames, pseudo_open_loop=pseudo_open_loop)
-    rng = np.random.default_rng(seed)
-
-    def mix(one, other):
-        return jax.tree.map(lambda a, b: factors[0] * a + factors[1] * b, one, other)
-
-    inputs = [
-        jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), (controller.init(), jnp.zeros(3)))
-        for _ in range(2)
-    ]
-    steps = mix(*(controller.step(*one) for one in inputs))
-    for got, expected in zip(jax.tree.leaves(controller.step(*mix(*inputs))), jax.tree.leaves(steps), strict=True):
-        np.testing.assert_allclose(got, expected, atol=1e-13)  # rounding of numbers up to about 20
+# -------------------------------------------------------------------------------------------- lost exposures
 
 
 def test_a_skipped_exposure_leaves_the_command_and_its_leak():

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from nlcwfs.errors import SettingsError
 from nlcwfs.feedback.delay_line import DelayLine
 from nlcwfs.feedback.loop_transfer import IntegratorLoop
+from nlcwfs.feedback.state import FeedbackState
 
 
 def largest_stable_gain(latency_frames: float, *, leak: float = 1.0, pseudo_open_loop: bool = False) -> float:
@@ -18,16 +19,6 @@ def largest_stable_gain(latency_frames: float, *, leak: float = 1.0, pseudo_open
         [2.0, 2.5, 1.0, 0.618]
     """
     return IntegratorLoop(latency_frames, leak, pseudo_open_loop).largest_stable_gain()
-
-
-class IntegratorState(eqx.Module):
-    """What an integrator carries from exposure to exposure.
-
-    Attributes:
-        line: The mirror during the exposure whose measurement comes next.
-    """
-
-    line: DelayLine
 
 
 class Integrator(eqx.Module):
@@ -72,10 +63,10 @@ class Integrator(eqx.Module):
             raise SettingsError("feedback.gain", rule, f"{most:g}")
         return cls(jnp.asarray(gain, dtype), loop)
 
-    def init(self) -> IntegratorState:
+    def init(self) -> FeedbackState:
         """A flat mirror."""
-        frames = self.loop.latency_frames
-        return IntegratorState(DelayLine.build(self.gain.size, latency_frames=frames, dtype=str(self.gain.dtype)))
+        latency_frames, dtype = self.loop.latency_frames, str(self.gain.dtype)
+        return FeedbackState.flat(self.gain.size, latency_frames=latency_frames, dtype=dtype)
 
     def command(self, line: DelayLine, measured_m: Float[Array, " mode"]) -> Float[Array, " mode"]:
         """The next command."""
@@ -83,13 +74,13 @@ class Integrator(eqx.Module):
         return self.loop.leak * line.newest_m + self.gain * error_m
 
     def step(
-        self, state: IntegratorState, measured_m: Float[Array, " mode"]
-    ) -> tuple[IntegratorState, Float[Array, " mode"]]:
+        self, state: FeedbackState, measured_m: Float[Array, " mode"]
+    ) -> tuple[FeedbackState, Float[Array, " mode"]]:
         """From the measurement of an exposure to the next command, which is already on its way in the state."""
         command_m = self.command(state.line, measured_m.astype(self.gain.dtype))
-        return IntegratorState(state.line.push(command_m)), command_m
+        return state.push(command_m), command_m
 
-    def skip(self, state: IntegratorState) -> tuple[IntegratorState, Float[Array, " mode"]]:
+    def skip(self, state: FeedbackState) -> tuple[FeedbackState, Float[Array, " mode"]]:
         """An exposure that measured nothing: the last command stays, less its leak."""
         command_m = self.loop.leak * state.line.newest_m
-        return IntegratorState(state.line.push(command_m)), command_m
+        return state.push(command_m), command_m

@@ -65,9 +65,9 @@ class IntegratorLoop:
         r"""The gain below which the loop forgets a bump.
 
         By halving: every root of :math:`z^{d+1} (z - l) + g ((1 - s) z + s)` has to be within the unit circle. For a
-        whole latency d without leak the limit is :math:`2 \sin(\pi / (4 d + 2))`. A latency
-        below half an exposure bears more than none: what is measured then is part of two commands. With pseudo-open-loop it is 1 + leak, whatever
-        the latency.
+        whole latency d without leak the limit is :math:`2 \sin(\pi / (4 d + 2))` (Levin & May 1976, Theor. Popul.
+        Biol. 9, 178). A latency below half an exposure bears more than none: what is measured then is part of two
+        commands. With pseudo-open-loop the limit is 1 + leak, whatever the latency.
         """
         if self.pseudo_open_loop:
             return 1 + self.leak

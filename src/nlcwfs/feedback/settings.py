@@ -28,8 +28,8 @@ class FeedbackSettings(BaseModel):
         default=0.0,
         ge=0,
         le=10,
-        description="exposures from the end of an exposure until its command is on the mirror; a part of one means that "
-        "the mirror changes within exposures",
+        description="exposures from the end of an exposure until its command is on the mirror; a part of one means "
+        "that the mirror changes within exposures",
     )
     pseudo_open_loop: bool = Field(
         default=True,
