@@ -12,6 +12,8 @@ from pydantic import ValidationError
 
 from nlcwfs.errors import SettingsError
 from nlcwfs.feedback.controller import Controller, Telemetry
+from nlcwfs.feedback.integrator import Integrator
+from nlcwfs.feedback.loop_transfer import IntegratorLoop
 from nlcwfs.feedback.modal_gains import optimal_gains
 from nlcwfs.feedback.settings import FeedbackSettings
 
@@ -70,7 +72,8 @@ def test_a_step_is_linear(seed, factors, latency_frames, name, frames):
 def test_until_it_learns_a_controller_is_the_integrator(name, latency_frames):
     air = np.random.default_rng(2).normal(size=(30, 3)).cumsum(0)
     options = {"gain": 0.6, "leak": 0.98, "latency_frames": latency_frames}
-    _, plain = closed_loop(controller(**options), air)
+    loop = IntegratorLoop(latency_frames, 0.98, pseudo_open_loop=True)
+    _, plain = closed_loop(Integrator.build(np.full(3, 0.6), loop=loop, dtype="float64"), air)
     _, command = closed_loop(controller(controller=name, **options), air)
     np.testing.assert_array_equal(command, plain)
 
