@@ -138,6 +138,30 @@ def figure(
 
 @app.command()
 @mendable
+def loop(
+    config: ConfigArgument = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; made if it is not there.")] = Path("run"),
+    seconds: Annotated[float | None, typer.Option(help="Simulated time.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Exposures in a second.")] = None,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Close the loop: air, mirror, sensor, wavefront, command; numbers, telemetry, image and picture in a folder.
+
+    Ends with 1 when the loop is not closed at the end.
+    """
+    from nlcwfs.commands.loop import loop as run
+    from nlcwfs.config import load_config
+
+    named = {"loop.seconds": seconds, "loop.rate_hz": rate, "seed": seed}
+    chosen = [*(settings or []), *(f"{key}={value}" for key, value in named.items() if value is not None)]
+    raise typer.Exit(run(load_config(config, chosen), out, resume=resume, quiet=quiet))
+
+
+@app.command()
+@mendable
 def study(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Holds study.toml, such as studies/01-single-frame.")

@@ -22,6 +22,9 @@ from nlcwfs.simulation.loop_light import LoopLight
 DOUBTS = 2
 """Frames in a row that are not explained before what was followed is given up."""
 
+SURE = 2
+"""Frames in a row that must be believed, each on its own, before they are followed."""
+
 PATIENT = {"healings": 8, "healing_iterations": 15, "agreement": 0.4}
 """At least so patient is the search while a loop is open, at D / r0 of 25 and more: with the defaults for single frames
 3 of 8 loops closed with islands that cost 50 nm and more, or not within 24 frames; so all closed within 12."""
@@ -121,11 +124,13 @@ class FollowedState(NamedTuple):
         memory: What is expected; None while the loop is not closed.
         doubts: Frames in a row that were not explained.
         since: Frames since the last second look.
+        sure: Frames in a row that were believed on their own.
     """
 
     memory: Memory | None
     doubts: int
     since: int
+    sure: int
 
 
 class FollowedCurvature(eqx.Module):
@@ -226,24 +231,25 @@ class FollowedCurvature(eqx.Module):
         memory: FollowedState | None,
     ) -> tuple[Sight, FollowedState]:
         """See `Measurement`."""
-        state = memory or FollowedState(None, 0, 0)
+        state = memory or FollowedState(None, 0, 0, 0)
         counts = exposure.frames.electrons
-        if state.memory is None:
+        if state.memory is None or state.sure < SURE:
             estimate, begun, residual_m = self._started(counts, usable, mirror_m)
             outcome = Outcome(int(estimate.outcome_code))
-            after = FollowedState(begun if outcome.succeeded else None, 0, 0)
-            return self._sight(estimate, residual_m, outcome, closed=False), after
+            sure = state.sure + 1 if outcome.succeeded else 0
+            after = FollowedState(begun if outcome.succeeded else None, 0, 0, sure)
+            return self._sight(estimate, residual_m, outcome, closed=sure >= SURE), after
         estimate, followed, residual_m = self._followed(counts, usable, mirror_m, state.memory)
         outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
-        doubts = 0 if outcome.succeeded else state.doubts + 1
-        since = state.since + 1
+        doubts, since = 0 if outcome.succeeded else state.doubts + 1, state.since + 1
         if outcome.succeeded and self.look_again_every and since >= self.look_again_every:
             again, followed, residual_m = self._again(counts, usable, mirror_m, followed)
             ffts, since = ffts + int(again.ffts), 0
         if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             followed = self.reconstructor.skip(state.memory)
+        lost = doubts >= DOUBTS
         sight = self._sight(estimate, residual_m, outcome, closed=True)._replace(ffts=ffts)
-        return sight, FollowedState(None if doubts >= DOUBTS else followed, doubts, since)
+        return sight, FollowedState(None if lost else followed, doubts, since, 0 if lost else state.sure)
 
     def _sight(self, estimate: WavefrontEstimate, residual_m: Array, outcome: Outcome, *, closed: bool) -> Sight:
         part_m = self.cautious.part(residual_m, outcome)

@@ -1,0 +1,123 @@
+"""`nlcwfs loop`: close the loop, and keep what happened."""
+
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from nlcwfs.commands.console import NOT_A_SUCCESS, device, say, undisturbed, use_precision, warn
+from nlcwfs.config import Config
+from nlcwfs.errors import FileFormatError, SettingsError
+from nlcwfs.interop import Provenance
+from nlcwfs.interop import loop_folder as folder_of
+from nlcwfs.simulation.loop import Loop, LoopState, Record
+from nlcwfs.simulation.loop_run import run_loop, summary
+
+CHECKPOINT_EVERY_S = 20.0
+"""Time between two checkpoints, in seconds of the computation."""
+
+
+def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
+    """Run a loop and write its folder.
+
+    Returns:
+        Exit code: 0 when the loop is closed at the end, 1 when not.
+
+    Raises:
+        NlcwfsError: If settings contradict each other or the folder cannot be used.
+    """
+    if config.beam.pupil_map is not None:
+        raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
+    use_precision(config.precision)
+    folder_of.prepare_folder(out, config, resume=resume)
+    stopped = folder_of.read_checkpoint(out, config) if resume else None
+    say("Making the air, the mirror and the reconstructor ...", quiet=quiet)
+    running = Loop.build(config)
+    state, records = stopped or (None, None)
+    if records:
+        say(f"Going on at frame {len(records)} of {config.loop.frames}.", quiet=quiet)
+    begun = time.perf_counter()
+    state, records = _run(running, out, state, records, quiet=quiet)
+    seconds = time.perf_counter() - begun
+    stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
+    with undisturbed():
+        numbers = _write(running, out, state, records, (seconds, stamp))
+    for line in account(numbers):
+        say(line, quiet=quiet)
+    say(f"Wrote {out}.", quiet=quiet)
+    if numbers["outcome"] != "closed":
+        warn(f"the loop is {numbers['outcome']}: {reason(numbers)}")
+        return NOT_A_SUCCESS
+    return 0
+
+
+def _run(
+    running: Loop, out: Path, state: LoopState | None, records: list[Record] | None, *, quiet: bool
+) -> tuple[LoopState, list[Record]]:
+    """The exposures, with a bar, and a checkpoint now and then and when interrupted."""
+    console, settings = Console(stderr=True), running.config.loop
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    last = [time.perf_counter(), state, records]
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("loop", total=settings.frames, completed=len(records or []))
+
+        def watch(state: LoopState, records: list[Record]) -> None:
+            strehl = f", Strehl {float(state.image.strehl):.2f}" if int(state.image.exposures) else ""
+            bar.update(task, completed=state.frame, description=f"{records[-1].rms_nm:.0f} nm{strehl}")
+            last[1:] = [state, records]
+            if time.perf_counter() - last[0] > CHECKPOINT_EVERY_S:
+                folder_of.write_checkpoint(out, running.config, state, records)
+                last[0] = time.perf_counter()
+
+        try:
+            state, records = run_loop(running, state=state, records=records, watch=watch)
+        except KeyboardInterrupt:
+            with undisturbed():
+                if last[1] is not None:
+                    folder_of.write_checkpoint(out, running.config, last[1], last[2])
+                    say(f"Kept {len(last[2])} frames in {out}; --resume goes on.")
+            raise
+    folder_of.write_checkpoint(out, running.config, state, records)
+    return state, records
+
+
+def _write(running: Loop, out: Path, state: LoopState, records: list[Record], made: tuple[float, Provenance]) -> dict:
+    """Everything that a run leaves behind."""
+    from nlcwfs.studies.loop_picture import draw_loop
+
+    seconds, stamp = made
+    if not out.is_dir():
+        raise FileFormatError(f"{out}: must stay where it is during a run, got no such folder")
+    numbers = summary(running, state, records, seconds)
+    folder_of.write_summary(out, numbers, stamp)
+    folder_of.write_records(out, running, records, stamp)
+    folder_of.write_telemetry(out, running, state, records, stamp)
+    if int(state.image.exposures):
+        folder_of.write_image(out, state, stamp)
+    draw_loop(out / folder_of.PICTURE, running, state, records)
+    return numbers
+
+
+def account(numbers: dict) -> list[str]:
+    """What a run says at its end."""
+    bounds, groups = numbers["bounds"], numbers["rms_by_group_nm"]
+    lines = [f"{numbers['frames']} frames at {numbers['rate_hz']:g} Hz: {numbers['outcome']}."]
+    if numbers["rms_nm"] is not None:
+        told = ", ".join(f"{name.replace('_', '-')} {value:.0f}" for name, value in groups.items())
+        lines.append(f"Residual {numbers['rms_nm']:.1f} nm rms ({told}); closed at frame {numbers['frames_to_close']}.")
+        lines.append(
+            f"Bounds: mirror {bounds['fitting_nm']:.0f} nm, lag {bounds['lag_nm']:.0f}, "
+            f"quantum limit {bounds['photon_nm']:.0f}, all {bounds['floor_nm']:.0f}; open {bounds['open_loop_nm']:.0f}."
+        )
+    if numbers["strehl"] is not None:
+        lines.append(f"Strehl {numbers['strehl']:.3f} at {numbers['science_wavelength_um']:g} um.")
+    return lines
+
+
+def reason(numbers: dict) -> str:
+    """Why a loop is not closed, as far as it can be told."""
+    if numbers["outcome"] == "lost":
+        return "it was closed, and is so no longer"
+    photons = numbers["photons_per_frame"]
+    return f"no wavefront was believed in {numbers['frames']} frames of {photons:g} photons (loop.give_up_s)"
