@@ -173,7 +173,7 @@ class MaximumAPosteriori(eqx.Module):
         self,
         near: Measurement,
         start_m: Float[Array, "y x"] | None = None,
-        mirror_rad: Float[Array, "y x"] | None = None,
+        mirror_rad: Float[Array, "Y X"] | None = None,
     ) -> Found:
         """All that the estimate is made of: first guess, solutions, healings.
 
@@ -187,7 +187,7 @@ class MaximumAPosteriori(eqx.Module):
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
         return Found(task, search, slope, climb.strength)
 
-    def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "y x"]:
+    def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """A phase of the model's grid on that of the first guess."""
         factor = self.level.oversampling
         return cropped(sum_blocks(phase_rad[None], factor)[0] / factor**2, self.capture.levels[-1].grid.shape)

@@ -137,7 +137,7 @@ class SequenceReconstructor(eqx.Module):
         usable: Bool[Array, "plane y x"],
         *,
         read_variance: float | Float[Array, ""] = 0.0,
-        known_m: Float[Array, "y x"] | None = None,
+        known_m: Float[Array, "Y X"] | None = None,
     ) -> tuple[WavefrontEstimate, Memory]:
         """The wavefront of a first frame, and what it tells of the next; arguments as for `follow`."""
         solver, grid = self.solver, self.solver.level.grid
@@ -159,7 +159,7 @@ class SequenceReconstructor(eqx.Module):
         memory: Memory,
         *,
         read_variance: float | Float[Array, ""] = 0.0,
-        known_m: Float[Array, "y x"] | None = None,
+        known_m: Float[Array, "Y X"] | None = None,
     ) -> tuple[WavefrontEstimate, Memory]:
         """A second, slow look at a frame that was followed: islands that came in over the rim are brought back.
 
@@ -198,7 +198,7 @@ class SequenceReconstructor(eqx.Module):
         memory: Memory,
         *,
         read_variance: float | Float[Array, ""] = 0.0,
-        known_m: Float[Array, "y x"] | None = None,
+        known_m: Float[Array, "Y X"] | None = None,
     ) -> tuple[WavefrontEstimate, Memory]:
         """The wavefront of the next frame, in a fixed number of FFTs, and what it tells of the one after.
 

@@ -20,7 +20,8 @@ from nlcwfs.science.rms_groups import rms_groups
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_faults import bump_m, damaged, fault_in
 from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_measurement import Measurement, Sight, build_measurement
+from nlcwfs.simulation.loop_measurement import Measurement, build_measurement
+from nlcwfs.simulation.loop_sight import Sight
 
 GROUPS = ("tip_tilt", "low", "middle", "high", "beyond")
 """Groups of modes in the order of `Record.group_nm2`: tilt, below 4 cycles per aperture, 4 to 12, above, the rest."""

@@ -15,9 +15,9 @@ def fault_in(settings: LoopSettings, frame: int) -> str:
     """The fault of a frame, or `none`.
 
     Examples:
-        >>> settings = LoopSettings(rate_hz=100, fault="lost", fault_at_s=0.1, fault_s=0.02)
+        >>> settings = LoopSettings(rate_hz=100, fault="lost-frames", fault_at_s=0.1, fault_s=0.02)
         >>> [fault_in(settings, frame) for frame in (9, 10, 11, 12)]
-        ['none', 'lost', 'lost', 'none']
+        ['none', 'lost-frames', 'lost-frames', 'none']
     """
     first = round(settings.fault_at_s * settings.rate_hz)
     last = first + max(1, round(settings.fault_s * settings.rate_hz))
@@ -38,11 +38,11 @@ def bump_m(settings: LoopSettings, light: LoopLight, frame: int) -> Float[Array,
 def damaged(fault: str, exposure: Exposure, before: Exposure | None) -> Exposure | None:
     """What arrives of an exposure; nothing when it is lost."""
     electrons = exposure.frames.electrons
-    if fault == "lost":
+    if fault == "lost-frames":
         return None
-    if fault == "doubled" and before is not None:
+    if fault == "doubled-frames" and before is not None:
         return before
-    if fault == "nan":
+    if fault == "nan-frames":
         electrons = jnp.full_like(electrons, np.nan)
     if fault == "dead-plane":
         electrons = electrons.at[0].set(0)

@@ -1,6 +1,6 @@
 """What a sensor and its reconstructor make of an exposure in a loop: coefficients of the mirror's modes."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.simulation.exposure import Exposure, distances_m, wavelength_m
 from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.loop_sight import Cautious, PixelModes, Sight
 
 DOUBTS = 2
 """Frames in a row that are not explained before what was followed is given up."""
@@ -28,93 +29,6 @@ SURE = 2
 PATIENT = {"healings": 8, "healing_iterations": 15, "agreement": 0.4}
 """At least so patient is the search while a loop is open, at D / r0 of 25 and more: with the defaults for single frames
 3 of 8 loops closed with islands that cost 50 nm and more, or not within 24 frames; so all closed within 12."""
-
-WORTH_FITTING = 0.02
-"""Combinations of modes that the pixels show less than this part of the clearest are left alone."""
-
-
-class Sight(NamedTuple):
-    """What was measured in one exposure.
-
-    Attributes:
-        residual_m: Of each mode of the mirror.
-        outcome: How the reconstruction ended.
-        predicted_m: Rms error that it expects of itself.
-        ffts: Two-dimensional FFTs of one plane that it took.
-        closed: Whether the frame was followed from the one before.
-    """
-
-    residual_m: Float[Array, " mode"]
-    outcome: Outcome
-    predicted_m: float
-    ffts: int
-    closed: bool
-
-
-class Measurement(Protocol):
-    """A sensor with its reconstructor; `memory` is its own, None before the first exposure."""
-
-    def measure(
-        self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: Any
-    ) -> tuple[Sight, Any]:
-        """What an exposure shows, with the mean shape of the mirror over it."""
-        ...
-
-
-class PixelModes(eqx.Module):
-    """From a wavefront on the detector's pixels to commands of the mirror, by least squares over the light."""
-
-    fit: Float[Array, "mode y x"]
-
-    @classmethod
-    def build(cls, light: LoopLight) -> "PixelModes":
-        """Average the mirror's shapes over pixels, and invert."""
-        still, mirror = light.still, light.mirror
-        weights = np.nan_to_num(np.asarray(still.pixel_weights(), float))
-        lit = weights > 0
-        root = np.sqrt(weights[lit])
-        on_pixels = eqx.filter_jit(lambda shape: still.on_pixels(still.on_light(shape)))
-        shapes = np.stack([np.asarray(on_pixels(mirror.opd_m(row)))[lit] for row in _unit_commands(mirror.count)])
-        tall = (np.nan_to_num(shapes) / UNIT_M * root).T
-        left, size, right = np.linalg.svd(tall - root[:, None] * (root @ tall)[None], full_matrices=False)
-        kept = size > WORTH_FITTING * size[0]
-        fit = np.zeros((mirror.count, *weights.shape))
-        fit[:, lit] = (right[kept].T / size[kept]) @ left[:, kept].T * root
-        return cls(jnp.asarray(fit, str(still.weights.dtype)))
-
-    def __call__(self, opd_m: Float[Array, "y x"]) -> Float[Array, " mode"]:
-        """The command that comes closest to a wavefront."""
-        return jnp.tensordot(self.fit, jnp.nan_to_num(opd_m).astype(self.fit.dtype), axes=2)
-
-
-UNIT_M = 1e-9
-"""Size of the commands by which the mirror's shapes are seen: far from any stroke."""
-
-
-def _unit_commands(count: int) -> Float[np.ndarray, "mode mode"]:
-    return UNIT_M * np.eye(count)
-
-
-class Cautious(eqx.Module):
-    """Less of a wavefront that is not believed: its fine waves may be islands that are a turn off.
-
-    Attributes:
-        kept: Share of each mode.
-    """
-
-    kept: Float[Array, " mode"]
-
-    @classmethod
-    def build(cls, config: Config, cycles_per_aperture: Float[np.ndarray, " mode"]) -> "Cautious":
-        """Shares that fall from the capture gain to nothing beyond the capture cutoff."""
-        kept = config.loop.capture_gain * np.exp(-((np.asarray(cycles_per_aperture) / config.loop.capture_cpa) ** 4))
-        return cls(jnp.asarray(kept, jnp.float32))
-
-    def part(self, residual_m: Float[Array, " mode"], outcome: Outcome) -> Float[Array, " mode"]:
-        """What the mirror should take out."""
-        if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
-            return jnp.zeros_like(residual_m)
-        return residual_m if outcome.succeeded else residual_m * self.kept.astype(residual_m.dtype)
 
 
 class FollowedState(NamedTuple):
@@ -230,7 +144,7 @@ class FollowedCurvature(eqx.Module):
         mirror_m: Float[Array, "lit_y lit_x"],
         memory: FollowedState | None,
     ) -> tuple[Sight, FollowedState]:
-        """See `Measurement`."""
+        """What an exposure shows; see `Measurement`."""
         state = memory or FollowedState(None, 0, 0, 0)
         counts = exposure.frames.electrons
         if state.memory is None or state.sure < SURE:
@@ -292,7 +206,7 @@ class SingleFrames(eqx.Module):
     def measure(
         self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
     ) -> tuple[Sight, None]:
-        """See `Measurement`."""
+        """What an exposure shows; see `Measurement`."""
         estimate, residual_m = self._estimated(exposure.frames.electrons, usable)
         outcome = Outcome(int(estimate.outcome_code))
         part_m = self.cautious.part(residual_m, outcome)
@@ -307,14 +221,18 @@ class IdealMeasurement(eqx.Module):
     def measure(
         self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
     ) -> tuple[Sight, None]:
-        """See `Measurement`."""
+        """What an exposure shows; see `Measurement`."""
         margins = [(a - b) // 2 for a, b in zip(exposure.opd_m.shape, mirror_m.shape, strict=True)]
         inner = tuple(slice(m, m + size) for m, size in zip(margins, mirror_m.shape, strict=True))
         residual_m = self.light.mirror.fitted(exposure.opd_m[inner])
         return Sight(residual_m, Outcome.CONVERGED, 0.0, 0, True), None
 
 
-def build_measurement(config: Config, light: LoopLight) -> FollowedCurvature | SingleFrames | IdealMeasurement:
+Measurement = FollowedCurvature | SingleFrames | IdealMeasurement
+"""A sensor with its reconstructor; `measure` carries a memory of its own, None before the first exposure."""
+
+
+def build_measurement(config: Config, light: LoopLight) -> Measurement:
     """The sensor and method that a configuration names.
 
     Raises:

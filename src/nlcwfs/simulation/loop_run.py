@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.feedback.controller import Telemetry
@@ -159,7 +159,7 @@ def loop_bounds(light: LoopLight) -> dict[str, float]:
     frames = int(min(light.sequence.longest, 1e6, AIR_SAMPLES * 50)) - 1
     numbers = np.linspace(0, max(frames - 1, 0), AIR_SAMPLES).astype(int)
 
-    def variance(opd_m: np.ndarray) -> float:
+    def variance(opd_m: Array) -> float:
         return float(jnp.sum(light.weights * (opd_m - jnp.sum(light.weights * opd_m)) ** 2))
 
     whole, fitting, lag = [], [], []

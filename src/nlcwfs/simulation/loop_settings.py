@@ -56,7 +56,7 @@ class LoopSettings(BaseModel):
     learn_after_s: float = Field(
         default=0.5, gt=0, description="Closed time after which gains or predictions are learnt (feedback.controller)."
     )
-    fault: Literal["none", "nan", "lost", "doubled", "dead-plane", "bump"] = Field(
+    fault: Literal["none", "nan-frames", "lost-frames", "doubled-frames", "dead-plane", "bump"] = Field(
         default="none",
         description="What goes wrong on purpose: frames of NaN, frames that do not come, old frames again, the first "
         "plane dark, or a bump in the wavefront that stays.",

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import scipy.fft
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from nlcwfs.atmosphere.frozen_flow import TAPS, FrozenFlow, WindLayer, unrepeated_s
 from nlcwfs.atmosphere.phase_screen import PhaseScreens
@@ -88,10 +88,10 @@ class SequenceSimulator(eqx.Module):
         """Frames until the air repeats; infinite in a calm."""
         return _frames_within(self.flow.unrepeated_s, self.rate_hz)
 
-    def moments_s(self, frame: int | Float[Array, ""]) -> Float[Array, " substep"]:
+    def moments_s(self, frame: int | Float[Array, ""] | Int[Array, ""]) -> Float[Array, " substep"]:
         """When the light of an exposure is computed; frame 0 begins at 0."""
         middle = (jnp.arange(self.substeps, dtype=self.still.weights.dtype) + 0.5) / self.substeps
-        return (frame + middle) / self.rate_hz
+        return (jnp.asarray(frame, middle.dtype) + middle) / self.rate_hz
 
     def expose(self, frame: int) -> Exposure:
         """One exposure of the sequence, counted from 0."""

@@ -1,0 +1,89 @@
+"""What a frame shows of the mirror's modes, and how much of it the mirror should take out."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nlcwfs.config import Config
+from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.simulation.loop_light import LoopLight
+
+WORTH_FITTING = 0.02
+"""Combinations of modes that the pixels show less than this part of the clearest are left alone."""
+
+
+class Sight(NamedTuple):
+    """What was measured in one exposure.
+
+    Attributes:
+        residual_m: Of each mode of the mirror.
+        outcome: How the reconstruction ended.
+        predicted_m: Rms error that it expects of itself.
+        ffts: Two-dimensional FFTs of one plane that it took.
+        closed: Whether the frame was followed from the one before.
+    """
+
+    residual_m: Float[Array, " mode"]
+    outcome: Outcome
+    predicted_m: float
+    ffts: int
+    closed: bool
+
+
+class PixelModes(eqx.Module):
+    """From a wavefront on the detector's pixels to commands of the mirror, by least squares over the light."""
+
+    fit: Float[Array, "mode y x"]
+
+    @classmethod
+    def build(cls, light: LoopLight) -> "PixelModes":
+        """Average the mirror's shapes over pixels, and invert."""
+        still, mirror = light.still, light.mirror
+        weights = np.nan_to_num(np.asarray(still.pixel_weights(), float))
+        lit = weights > 0
+        root = np.sqrt(weights[lit])
+        on_pixels = eqx.filter_jit(lambda shape: still.on_pixels(still.on_light(shape)))
+        shapes = np.stack([np.asarray(on_pixels(mirror.opd_m(row)))[lit] for row in _unit_commands(mirror.count)])
+        tall = (np.nan_to_num(shapes) / UNIT_M * root).T
+        left, size, right = np.linalg.svd(tall - root[:, None] * (root @ tall)[None], full_matrices=False)
+        kept = size > WORTH_FITTING * size[0]
+        fit = np.zeros((mirror.count, *weights.shape))
+        fit[:, lit] = (right[kept].T / size[kept]) @ left[:, kept].T * root
+        return cls(jnp.asarray(fit, str(still.weights.dtype)))
+
+    def __call__(self, opd_m: Float[Array, "y x"]) -> Float[Array, " mode"]:
+        """The command that comes closest to a wavefront."""
+        return jnp.tensordot(self.fit, jnp.nan_to_num(opd_m).astype(self.fit.dtype), axes=2)
+
+
+UNIT_M = 1e-9
+"""Size of the commands by which the mirror's shapes are seen: far from any stroke."""
+
+
+def _unit_commands(count: int) -> Float[np.ndarray, "mode mode"]:
+    return UNIT_M * np.eye(count)
+
+
+class Cautious(eqx.Module):
+    """Less of a wavefront that is not believed: its fine waves may be islands that are a turn off.
+
+    Attributes:
+        kept: Share of each mode.
+    """
+
+    kept: Float[Array, " mode"]
+
+    @classmethod
+    def build(cls, config: Config, cycles_per_aperture: Float[np.ndarray, " mode"]) -> "Cautious":
+        """Shares that fall from the capture gain to nothing beyond the capture cutoff."""
+        kept = config.loop.capture_gain * np.exp(-((np.asarray(cycles_per_aperture) / config.loop.capture_cpa) ** 4))
+        return cls(jnp.asarray(kept, jnp.float32))
+
+    def part(self, residual_m: Float[Array, " mode"], outcome: Outcome) -> Float[Array, " mode"]:
+        """What the mirror should take out."""
+        if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+            return jnp.zeros_like(residual_m)
+        return residual_m if outcome.succeeded else residual_m * self.kept.astype(residual_m.dtype)
