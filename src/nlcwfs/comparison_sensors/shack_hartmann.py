@@ -173,7 +173,10 @@ class ShackHartmann(eqx.Module):
             Photons per pixel. They sum to the photons on the subapertures that serve, less the light outside their
             fields of view, see `fraction_outside_field`.
         """
-        parts_m = self.subaperture_maps(opd_m.astype(self.amplitude.dtype))
+        return self.images_of_parts(self.subaperture_maps(opd_m.astype(self.amplitude.dtype)), photons)
+
+    def images_of_parts(self, parts_m: Float[Array, "spot y x"], photons: float | Float[Array, ""]) -> Spots:
+        """The same from a wavefront that is cut already, see `subaperture_maps`."""
         total = jnp.zeros((), self.amplitude.dtype)
         for to_sky, wavelength_m, share in zip(
             self.to_sky, self.spectrum.wavelengths_m, self.spectrum.shares, strict=True
@@ -270,7 +273,7 @@ def _cells_of_subaperture(grid: Grid, diameter_m: float, settings: ShackHartmann
 
 
 def _fourier_matrix(angles: Grid, cells: Grid, wavelength_m: float) -> Complex[np.ndarray, "sample cell"]:
-    r"""Transform along one axis: :math:`\sqrt{a \Delta\theta/\lambda}\,\mathrm{sinc}(a\theta/\lambda) e^{-2\pi i...}`."""
+    """Fourier transform along one axis, times the sinc of a uniform cell; keeps the light's total."""
     turn = np.exp(-2j * np.pi / wavelength_m * angles.x_m.T * cells.x_m)
     envelope = np.sinc(cells.pixel_m * angles.x_m.T / wavelength_m)
     return math.sqrt(cells.pixel_m * angles.pixel_m / wavelength_m) * envelope * turn
