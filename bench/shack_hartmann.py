@@ -1,4 +1,4 @@
-"""What a Shack-Hartmann sensor leaves in a closed loop: the honest rival of the curvature sensor, with its best centroid.
+"""What a Shack-Hartmann sensor leaves in a closed loop: the honest rival of the curvature sensor.
 
 8 m telescope, 0.6 arcsec of Kolmogorov's turbulence in one frozen layer at 10 m/s, 0.85 um, 3e6 photons/s, 160 Hz. A
 plain integrator; the command from one exposure is on during the next; exposures see the air of their middle. The mirror

@@ -23,8 +23,8 @@ CELLS_PER_FIELD = 1.5
 """Fewest cells of a subaperture, over its field in lambda / d: the discrete transform repeats after as many lambda / d
 as there are cells, and half of the field stays between the field and its repetition."""
 
-FINEST_PIXEL = 0.25
-"""Widest sample of an image, in lambda / d; wider pixels are sums. Images hold no finer detail than lambda / d."""
+FINEST_PIXEL = 0.125
+"""Widest sample of an image, in lambda / d; wider pixels are sums. A sample stands for its area to 1 % of the peak."""
 
 
 class Spots(eqx.Module):

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann
 from nlcwfs.errors import SettingsError
@@ -177,7 +177,7 @@ def centre_of_gravity(model: SpotModel, *, threshold: float = 0.0) -> SpotFilter
     """Centre of all the light in the window.
 
     Its photon noise grows with the window: the wings of a square lenslet fall as 1 / angle^2, and each part of the
-    window adds as much variance. A threshold cuts read noise; with photon noise alone it gains nothing.
+    window adds as much variance. A threshold cuts read noise; with photon noise alone it gains little.
 
     Args:
         model: Spots to calibrate the gain on.
@@ -242,6 +242,7 @@ def matched_filter(model: SpotModel, *, extra_electrons2: float = 0.0) -> SpotFi
     """
     faintest = FAINTEST * jnp.max(model.mean, axis=(1, 2), keepdims=True)
     variance = jnp.maximum(model.mean, faintest) + extra_electrons2
+    variance = jnp.where(variance > 0, variance, 1)  # of a dark spot
     shapes = jnp.stack([model.along_y * model.pixel_rad, model.along_x * model.pixel_rad, model.mean])
     weighted = shapes / variance[None]
     fisher = jnp.einsum("asvu,bsvu->sab", weighted, shapes)
@@ -285,16 +286,6 @@ class MeanSpot(eqx.Module):
     def model(self, *, pixel_rad: float) -> SpotModel:
         """The spot and how it moves, for a filter that serves all subapertures."""
         return SpotModel.of_mean(self.shape, pixel_rad=pixel_rad)
-
-
-def empty_spots(electrons: Float[Array, "spot v u"]) -> Bool[Array, " spot"]:
-    """Which spots have no light at all.
-
-    Examples:
-        >>> empty_spots(jnp.zeros((2, 3, 3)).at[1, 0, 0].set(1.0))
-        Array([ True, False], dtype=bool)
-    """
-    return jnp.sum(electrons, axis=(1, 2)) <= 0
 
 
 def _angles(model: SpotModel) -> tuple[Float[Array, "1 v u"], Float[Array, "1 v u"]]:
