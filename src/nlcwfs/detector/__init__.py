@@ -23,6 +23,7 @@ from nlcwfs.detector.photon_noise import sample_poisson
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
 from nlcwfs.detector.settings import DetectorSettings
+from nlcwfs.detector.sparse_photons import room_for_photons, sample_sparse_photons
 
 __all__ = [
     "Detector",
@@ -35,5 +36,7 @@ __all__ = [
     "fraction_outside_window",
     "integrate_on_pixels",
     "multiply_electrons",
+    "room_for_photons",
     "sample_poisson",
+    "sample_sparse_photons",
 ]
