@@ -134,14 +134,16 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
         framerate=rate_hz,
         delay=loop.config.feedback.latency_frames / rate_hz,
     )
+    image = {}
+    if int(state.image.exposures):
+        image = {"strehl_ratio": float(state.image.strehl), "strehl_wavelength": state.image.wavelength_m}
     begun = datetime.now(UTC)
     system = aotpy.AOSystem(
         ao_mode="SCAO",
         date_beginning=begun,
         date_end=begun,
         name="nlcwfs simulation",
-        strehl_ratio=float(state.image.strehl) if int(state.image.exposures) else None,
-        strehl_wavelength=state.image.wavelength_m,
+        **image,
         main_telescope=telescope,
         sources=[star],
         wavefront_sensors=[sensor],
@@ -157,16 +159,12 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
 def write_records(folder: Path, loop: Loop, records: list[Record], stamp: Provenance) -> None:
     """One row for each exposure, as `frames.ecsv`."""
     told = LoopTelemetry.of(records)
-    table = Table()
-    table["time_s"] = np.arange(len(records)) / loop.config.loop.rate_hz
-    table["rms_nm"] = told.rms_nm
+    columns = {"time_s": np.round(np.arange(len(records)) / loop.config.loop.rate_hz, 6)}
+    columns["rms_nm"] = np.round(told.rms_nm, 3)
     for place, name in enumerate(GROUPS):
-        table[f"{name}_nm"] = told.group_nm[:, place]
-    table["predicted_nm"] = told.predicted_nm
-    table["outcome"], table["followed"], table["ffts"] = told.outcome, told.closed, told.ffts
-    for name in table.colnames:
-        if table[name].dtype.kind == "f":
-            table[name] = np.round(table[name], 6 if name == "time_s" else 3)
-    table.meta = stamp.as_dict()
+        columns[f"{name}_nm"] = np.round(told.group_nm[:, place], 3)
+    columns |= {"predicted_nm": np.round(told.predicted_nm, 3), "outcome": told.outcome}
+    columns |= {"followed": told.closed, "ffts": told.ffts}
+    table = Table(columns, meta=stamp.as_dict())
     with atomic_write(folder / RECORDS) as path:
         table.write(path, format="ascii.ecsv", overwrite=True)

@@ -25,12 +25,13 @@ def fault_in(settings: LoopSettings, frame: int) -> str:
 
 
 def bump_m(settings: LoopSettings, light: LoopLight, frame: int) -> Float[Array, "lit_y lit_x"]:
-    """The bump's wavefront in a frame: smooth noise of the given rms from its beginning on, else nothing."""
+    """The bump's wavefront in a frame: another piece of turbulence, of the given rms, from its beginning on."""
     flat = jnp.zeros_like(light.weights)
     if settings.fault != "bump" or frame < round(settings.fault_at_s * settings.rate_hz):
         return flat
-    commands = jax.random.normal(jax.random.key(7), (min(60, light.mirror.count),), flat.dtype)
-    shape_m = light.mirror.opd_m(jnp.zeros(light.mirror.count, flat.dtype).at[: commands.size].set(commands) * 1e-9)
+    falls = np.maximum(np.asarray(light.mirror.cycles_per_aperture), 0.5) ** (-11 / 6)  # Kolmogorov's amplitudes
+    noise = jax.random.normal(jax.random.key(7), (light.mirror.count,), flat.dtype)
+    shape_m = light.mirror.opd_m(noise * jnp.asarray(falls * 1e-9, flat.dtype))
     rms_m = jnp.sqrt(jnp.sum(light.weights * shape_m**2))
     return shape_m * (settings.bump_nm * 1e-9 / rms_m)
 

@@ -89,13 +89,13 @@ class FollowedCurvature(eqx.Module):
         level = sequence.solver.level
         coarser = still.factor // level.oversampling
         lit = np.asarray(level.light) > 0
-        nearest = scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True)
+        nearest = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
         corner = [(a * coarser - b) // 2 for a, b in zip(level.grid.shape, light.weights.shape, strict=True)]
         camera = config.detector
         return cls(
             reconstructor=sequence,
             pixels=PixelModes.build(light),
-            cautious=Cautious.build(config, light.mirror.cycles_per_aperture),
+            cautious=Cautious.build(config, np.asarray(light.mirror.cycles_per_aperture)),
             corner=(corner[0], corner[1]),
             nearest=(nearest[0], nearest[1]),
             coarser=coarser,
@@ -193,7 +193,7 @@ class SingleFrames(eqx.Module):
         return cls(
             reconstructor=build_reconstructor(geometry, settings, basis=basis),
             pixels=PixelModes.build(light),
-            cautious=Cautious.build(config, light.mirror.cycles_per_aperture),
+            cautious=Cautious.build(config, np.asarray(light.mirror.cycles_per_aperture)),
             read_variance=camera.read_noise_electrons**2 / camera.em_gain**2
             + light.still.detector.background_electrons,
         )

@@ -45,7 +45,7 @@ class LoopSettings(BaseModel):
         "frame is reconstructed on its own.",
     )
     look_again_every: int = Field(
-        default=20,
+        default=5,
         ge=0,
         description="Frames from one slow second look at a followed frame to the next, which brings islands back that "
         "are a turn off; 0 for none.",

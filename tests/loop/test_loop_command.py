@@ -1,0 +1,157 @@
+"""`nlcwfs loop`: the folder that it leaves, and what it says of bad input."""
+
+import json
+import sys
+from pathlib import Path
+
+import aotpy
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from small_loop import SMALL, small
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "stages"))
+from command_line import type_in
+
+from nlcwfs.commands import loop as command
+from nlcwfs.interop import loop_folder as folder_of
+from nlcwfs.simulation.loop import Loop
+from nlcwfs.simulation.loop_run import run_loop
+
+
+def typed(out, *words, settings=()):
+    sets = [word for setting in [*SMALL, *settings] for word in ("--set", setting)]
+    return type_in("loop", "--out", out, *sets, *words)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("loop") / "run"
+    result = typed(out)
+    assert result.exit_code == 0, result.output
+    return out, result.output
+
+
+def test_the_folder_holds_what_happened(run):
+    out, said = run
+    numbers = json.loads((out / "summary.json").read_text())
+    assert numbers["outcome"] == "closed"
+    assert numbers["frames"] == 60
+    assert set(numbers) >= {"rms_nm", "rms_by_group_nm", "strehl", "rate_hz", "frames_to_close", "seconds", "bounds"}
+    assert f"{numbers['rms_nm']:.1f} nm rms" in said
+    frames = Table.read(out / "frames.ecsv")
+    assert len(frames) == 60
+    counted = frames["rms_nm"][-numbers["frames_counted"] :]
+    assert np.sqrt(np.mean(counted**2)) == pytest.approx(numbers["rms_nm"], abs=0.01)
+    assert numbers["provenance"]["seed"] == 0
+    assert (out / "loop.png").stat().st_size > 20_000
+
+
+def test_the_image_is_fits_and_knows_its_strehl(run):
+    out, _ = run
+    with fits.open(out / "psf.fits") as hdus:
+        hdus.verify("exception")
+        image, header = hdus[0].data, hdus[0].header
+    middle = np.array(image.shape) // 2
+    assert np.unravel_index(np.argmax(image), image.shape) == pytest.approx(tuple(middle), abs=1)
+    assert header["STREHL"] == pytest.approx(image[tuple(middle)], rel=0.02)  # the middle pixel is the axis
+    # lambda / D / 2 is 43.8 mas for 2 m at 0.85 um.
+    assert header["PIXSCALE"] == pytest.approx(0.0438, rel=0.01)
+
+
+def test_the_telemetry_opens_as_the_standard_says(run):
+    out, _ = run
+    system = (
+        aotpy.read_system_from_file(str(out / "telemetry.fits"))
+        if hasattr(aotpy, "read_system_from_file")
+        else aotpy.AOSystem.read_from_file(str(out / "telemetry.fits"))
+    )
+    (control,) = system.loops
+    assert control.framerate == 500
+    assert control.commands.data.shape[0] == 60
+    assert np.all(np.asarray(control.commands.data)[0] == 0)  # the mirror is flat at first
+    assert np.std(np.asarray(control.commands.data)[-1]) > 1e-8
+    assert system.main_telescope.enclosing_diameter == 2.0
+
+
+def test_a_folder_with_a_run_is_not_overwritten(run):
+    out, _ = run
+    result = typed(out)
+    assert result.exit_code == 2
+    assert "must be empty or new, got a folder with a run" in result.output
+
+
+def test_a_run_goes_on_with_its_own_settings_only(run):
+    out, _ = run
+    result = typed(out, "--resume", settings=["seed=5"])
+    assert result.exit_code == 2
+    assert "must be resumed with the settings of" in result.output
+
+
+def test_an_interrupted_run_ends_as_one_that_was_not(tmp_path):
+    config = small("loop.seconds=0.04")
+    loop = Loop.build(config)
+    _, whole = run_loop(loop)
+    folder_of.prepare_folder(tmp_path / "run", config, resume=False)
+
+    def stop(state, records):
+        if len(records) == 12:
+            folder_of.write_checkpoint(tmp_path / "run", config, state, records)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_loop(loop, watch=stop)
+    state, records = folder_of.read_checkpoint(tmp_path / "run", config)
+    _, resumed = run_loop(Loop.build(config), state=state, records=records)
+    assert [one.rms_nm for one in resumed] == [one.rms_nm for one in whole]
+
+
+def test_a_damaged_checkpoint_is_told(tmp_path):
+    (tmp_path / "checkpoint.pickle").write_bytes(b"not one")
+    result = typed(tmp_path, "--resume")
+    assert result.exit_code == 2
+    assert "checkpoint.pickle: must be a whole checkpoint" in result.output
+
+
+def test_a_star_too_faint_ends_with_one(tmp_path):
+    result = typed(tmp_path / "run", settings=["atmosphere.photons_per_s=2e3", "loop.give_up_s=0.03"])
+    assert result.exit_code == 1
+    assert "the loop is not closed: no wavefront was believed in 15 frames of 4 photons" in result.output
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["rms_nm"] is None
+
+
+@pytest.mark.parametrize(
+    ("setting", "rule"),
+    [
+        ("atmosphere.photons_per_s=0", "atmosphere.photons_per_s: must be"),
+        ("loop.rate_hz=2", "loop.rate_hz: must be higher"),
+        ("feedback.gain=3", "feedback.gain: must be"),
+        ("mirror.cutoff_cpa=40", "mirror.cutoff_cpa"),
+        ("loop.sensor=pyramid", "loop.sensor: must be"),
+    ],
+)
+def test_settings_that_cannot_be_are_told_in_a_line(tmp_path, setting, rule):
+    result = typed(tmp_path / "run", settings=[setting])
+    assert result.exit_code == 2
+    assert rule in result.output
+    assert not (tmp_path / "run" / "summary.json").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    result = typed(tmp_path / "file" / "run")
+    assert result.exit_code == 2
+    assert "must be a folder that can be written" in result.output
+
+
+def test_a_folder_that_goes_away_is_told(tmp_path, monkeypatch):
+    def gone(running, out, state, records, *, quiet):
+        (out / "config.toml").unlink()
+        out.rmdir()
+        return running.init(), []
+
+    monkeypatch.setattr(command, "_run", gone)
+    result = typed(tmp_path / "run")
+    assert result.exit_code == 2
+    assert "must stay where it is during a run" in result.output
