@@ -24,9 +24,8 @@ def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record]) -
     told, bounds = LoopTelemetry.of(records), loop_bounds(loop.light)
     time_s = np.arange(len(records)) / loop.config.loop.rate_hz
     figure = Figure(figsize=(11, 7), layout="constrained")
-    above, below = np.ravel(figure.subfigures(2, 1, height_ratios=(1, 1.1)))
-    top = above.add_subplot()
-    left, right = below.add_subplot(1, 2, 1), below.add_subplot(1, 2, 2)
+    cells = figure.add_gridspec(2, 2, height_ratios=(1, 1.1), width_ratios=(1.3, 1))
+    top, left, right = (figure.add_subplot(cells[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
     top.semilogy(time_s, told.rms_nm, color="black", lw=1, label="residual")
     top.axhline(bounds["floor_nm"], color="gray", ls="--", lw=1, label="mirror, lag and quantum limit")
     first = counted_from(loop, state)
