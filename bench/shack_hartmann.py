@@ -27,7 +27,8 @@ from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann, lenslet_grid
 from nlcwfs.detector.sparse_photons import room_for_photons, sample_sparse_photons
 from nlcwfs.estimation.slopes_to_modes import ModalReconstructor, average_gradients, minimum_variance, response
-from nlcwfs.estimation.spot_centroids import MeanSpot, SpotModel, centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_centroids import centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_model import MeanSpot, SpotModel
 
 DIAMETER_M = 8.0
 WAVELENGTH_M = 0.85e-6
