@@ -4,6 +4,9 @@
 plain integrator; the command from one exposure is on during the next; exposures see the air of their middle. The mirror
 makes Karhunen-Loeve modes exactly and starts closed. Scores are the rms over the light of the pupil, piston removed,
 tilt included, after 10 frames; turbulence finer than the cells of the light is added in square.
+
+Measured at gain 1 and all modes up to D/(2d): D/d 18, seeds 0 and 1: centre of gravity 134 and 135 nm, matched filter
+135 and 142; D/d 36, seeds 0 to 3: 141, 159, 147 and 135; 113, 128, 119 and 113. About 17 and 11 frames/s on two cores.
 """
 
 import argparse
@@ -27,7 +30,8 @@ from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann, lenslet_grid
 from nlcwfs.detector.sparse_photons import room_for_photons, sample_sparse_photons
 from nlcwfs.estimation.slopes_to_modes import ModalReconstructor, average_gradients, minimum_variance, response
-from nlcwfs.estimation.spot_centroids import MeanSpot, SpotModel, centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_centroids import centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_model import MeanSpot, SpotModel
 
 DIAMETER_M = 8.0
 WAVELENGTH_M = 0.85e-6
@@ -217,7 +221,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--subapertures", type=int, nargs="*", default=[18, 36])
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--gains", type=float, nargs="*", default=[0.4, 0.7, 1.0])
     parser.add_argument("--frames", type=int, default=48)
     given = parser.parse_args()

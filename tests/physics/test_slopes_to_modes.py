@@ -19,7 +19,8 @@ from nlcwfs.estimation.slopes_to_modes import (
     response,
     truncated_inverse,
 )
-from nlcwfs.estimation.spot_centroids import SpotModel, centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_centroids import centre_of_gravity, matched_filter
+from nlcwfs.estimation.spot_model import SpotModel
 
 WAVELENGTH_M, DIAMETER_M, ACROSS = 0.85e-6, 8.0, 12
 AIR = Turbulence.from_rms(opd_rms_m=80e-9, diameter_m=DIAMETER_M)  # weak: spots stay whole, slopes linear

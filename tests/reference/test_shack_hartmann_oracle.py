@@ -9,7 +9,8 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann
-from nlcwfs.estimation.spot_centroids import SpotModel, centre_of_gravity
+from nlcwfs.estimation.spot_centroids import centre_of_gravity
+from nlcwfs.estimation.spot_model import SpotModel
 
 WAVELENGTH_M = 0.85e-6
 LENSLETS, CELLS = 4, 128

@@ -160,7 +160,7 @@ class ShackHartmann(eqx.Module):
     def subaperture_maps(self, opd_m: Float[Array, "Y X"]) -> Float[Array, "spot y x"]:
         """A map on the cells of the light, cut into the subapertures that serve."""
         parts = cut_into_subapertures(opd_m, self.subapertures, self.amplitude.shape[1])
-        return jnp.asarray(parts[self.places[:, 0], self.places[:, 1]])
+        return jnp.asarray(parts)[self.places[:, 0], self.places[:, 1]]
 
     def images(self, opd_m: Float[Array, "Y X"], photons: float | Float[Array, ""]) -> Spots:
         """The photons on every pixel.

@@ -86,7 +86,8 @@ def diffractive_response(
         >>> from nlcwfs.beam.grid import Grid
         >>> from nlcwfs.beam.spectrum import Spectrum
         >>> from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
-        >>> from nlcwfs.estimation.spot_centroids import SpotModel, matched_filter
+        >>> from nlcwfs.estimation.spot_centroids import matched_filter
+        >>> from nlcwfs.estimation.spot_model import SpotModel
         >>> grid, settings = Grid((24, 24), 0.1), ShackHartmannSettings(subapertures=2)
         >>> sensor = ShackHartmann.build(
         ...     np.ones((24, 24)), grid, diameter_m=2.4, spectrum=Spectrum.monochromatic(1e-6), settings=settings

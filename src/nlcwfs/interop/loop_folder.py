@@ -134,16 +134,12 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
         framerate=rate_hz,
         delay=loop.config.feedback.latency_frames / rate_hz,
     )
-    image = {}
-    if int(state.image.exposures):
-        image = {"strehl_ratio": float(state.image.strehl), "strehl_wavelength": state.image.wavelength_m}
     begun = datetime.now(UTC)
     system = aotpy.AOSystem(
         ao_mode="SCAO",
         date_beginning=begun,
         date_end=begun,
         name="nlcwfs simulation",
-        **image,
         main_telescope=telescope,
         sources=[star],
         wavefront_sensors=[sensor],
@@ -151,6 +147,8 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
         loops=[control],
         metadata=[aotpy.Metadatum(key, value, comment) for key, value, comment in stamp.cards()],
     )
+    if int(state.image.exposures):
+        system.strehl_ratio, system.strehl_wavelength = float(state.image.strehl), state.image.wavelength_m
     with atomic_write(folder / TELEMETRY) as path:
         path.unlink(missing_ok=True)
         system.write_to_file(str(path))
@@ -159,7 +157,7 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
 def write_records(folder: Path, loop: Loop, records: list[Record], stamp: Provenance) -> None:
     """One row for each exposure, as `frames.ecsv`."""
     told = LoopTelemetry.of(records)
-    columns = {"time_s": np.round(np.arange(len(records)) / loop.config.loop.rate_hz, 6)}
+    columns: dict[str, np.ndarray] = {"time_s": np.round(np.arange(len(records)) / loop.config.loop.rate_hz, 6)}
     columns["rms_nm"] = np.round(told.rms_nm, 3)
     for place, name in enumerate(GROUPS):
         columns[f"{name}_nm"] = np.round(told.group_nm[:, place], 3)

@@ -10,7 +10,8 @@ from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann, cut_into_subapertures, lenslet_grid
 from nlcwfs.errors import SamplingError, SettingsError
-from nlcwfs.estimation.spot_centroids import SpotModel, centre_of_gravity, weighted_centre_of_gravity
+from nlcwfs.estimation.spot_centroids import centre_of_gravity, weighted_centre_of_gravity
+from nlcwfs.estimation.spot_model import SpotModel
 
 LIGHT = Spectrum.monochromatic(0.85e-6)
 
