@@ -123,7 +123,14 @@ class LoopLight(eqx.Module):
 
 
 def sequence_config(config: Config) -> Config:
-    """The same, as the sequence that a loop exposes: its rate, its length, its light, and air that lasts."""
+    """The same, as the sequence that a loop exposes: its rate, its length, its light, and air that lasts.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> config = sequence_config(load_config(None, ["atmosphere.photons_per_s=3e6", "loop.rate_hz=300"]))
+        >>> config.atmosphere.photons, config.simulation.frames
+        (10000.0, 300)
+    """
     loop, sky = config.loop, config.atmosphere
     photons = sky.photons if sky.photons_per_s is None else sky.photons_per_s / loop.rate_hz
     carried_m = max(sky.wind_speeds_m_per_s) * loop.seconds

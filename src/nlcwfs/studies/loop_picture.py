@@ -36,6 +36,8 @@ def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record]) -
     top.set(xlabel="time [s]", ylabel="rms [nm]", title=f"{loop.config.loop.rate_hz:g} Hz")
     top.legend(fontsize=8, ncols=4)
     for place, name in enumerate(GROUPS):
+        if not told.group_nm[:, place].any():
+            continue
         left.semilogy(time_s, np.maximum(told.group_nm[:, place], 0.1), lw=1, label=name.replace("_", "-"))
     left.set(xlabel="time [s]", ylabel="rms by group [nm]")
     left.legend(fontsize=8, ncols=2)
