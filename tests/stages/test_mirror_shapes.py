@@ -202,7 +202,6 @@ def test_single_precision_is_good_enough_for_nanometres():
             {"kind": "actuators", "modes": 40},
             "modes: must be left out with actuators, which actuators_across counts, got 40",
         ),
-        ({"cutoff_cpa": None}, "cutoff_cpa: must be given when modes is not, got nothing"),
         ({"stroke_nm": 400}, "stroke_nm: unknown key, got 400; the unit is in the name: did you mean stroke_um [um]?"),
     ],
 )

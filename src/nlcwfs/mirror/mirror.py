@@ -148,7 +148,7 @@ def _check_sampling(settings: MirrorSettings, pixels: float) -> None:
         if settings.actuators_across - 1 > pixels * (1 + 1e-9):
             rule = f"must be at most {math.floor(pixels) + 1}, one for each pixel of the telescope"
             raise SamplingError("mirror.actuators_across", rule, settings.actuators_across)
-    elif settings.modes is None and settings.cutoff_cpa is not None and settings.cutoff_cpa > pixels / 2:
+    elif settings.modes is None and settings.cutoff_cpa > pixels / 2:
         rule = f"must be at most {pixels / 2:g}, half a cycle for each pixel of the telescope"
         raise SamplingError("mirror.cutoff_cpa", rule, settings.cutoff_cpa)
 

@@ -21,7 +21,7 @@ class MirrorSettings(BaseModel):
         default="karhunen-loeve",
         description="shapes of the mirror: ideal ones, of which each command moves a whole mode, or actuators",
     )
-    cutoff_cpa: float | None = Field(
+    cutoff_cpa: float = Field(
         default=16.0,
         ge=1,
         le=500,
@@ -55,6 +55,4 @@ class MirrorSettings(BaseModel):
     def _shapes_are_counted_once(self) -> "MirrorSettings":
         if self.kind == "actuators" and self.modes is not None:
             raise ValueError("modes must be left out with actuators, which actuators_across counts")
-        if self.kind != "actuators" and self.modes is None and self.cutoff_cpa is None:
-            raise ValueError("cutoff_cpa must be given when modes is not")
         return self

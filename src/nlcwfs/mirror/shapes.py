@@ -44,7 +44,7 @@ def karhunen_loeve_shapes(
     if settings.modes is not None:
         basis = modal_basis(pupil, grid, diameter_m=diameter_m, count=settings.modes)
     else:
-        basis = _basis_up_to(settings.cutoff_cpa or 0.0, pupil, grid, diameter_m)
+        basis = _basis_up_to(settings.cutoff_cpa, pupil, grid, diameter_m)
     lit = np.asarray(basis.weights) > 0
     return np.asarray(basis.modes)[:, lit].T, np.asarray(basis.cycles_per_aperture)
 
@@ -70,7 +70,7 @@ def zernike_shapes(
         44
     """
     order = 1
-    if settings.modes is None and settings.cutoff_cpa is not None:
+    if settings.modes is None:
         while _cycles_of_order(order + 1) <= settings.cutoff_cpa:
             order += 1
     count = settings.modes or order * (order + 3) // 2
@@ -102,7 +102,7 @@ def fourier_shapes(settings: MirrorSettings, lit: Bool[np.ndarray, "y x"], grid:
         [0.5, 0.5, 1.0, 1.0, 1.0, 1.0]
     """
     y, x = (axis[lit][:, None] / diameter_m for axis in np.broadcast_arrays(grid.y_m, grid.x_m))
-    farthest = settings.cutoff_cpa or 0.0
+    farthest = settings.cutoff_cpa
     if settings.modes is not None:
         farthest = math.sqrt(settings.modes / math.pi) + 2  # a circle of so many points of the lattice, and a rim
     steps = np.arange(-math.floor(farthest), math.floor(farthest) + 1)
