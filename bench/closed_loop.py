@@ -30,8 +30,8 @@ from nlcwfs.estimation.wave_sensitivity import LAGS
 from nlcwfs.estimation.whitened_phase import Unknown
 from nlcwfs.interop import Provenance
 from nlcwfs.simulation.exposure import frame_key
+from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.sequence import SequenceSimulator
-from nlcwfs.studies.study_light import geometry_of
 
 RATE_HZ = 260.0
 PHOTONS_PER_S = 3e6

@@ -20,7 +20,7 @@ from nlcwfs.config import load_config
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
-from nlcwfs.studies.study_light import geometry_of
+from nlcwfs.simulation.known_sensor import geometry_of
 
 FRAME = ["beam.wavelength_um=0.65", "atmosphere.opd_rms_nm=609", "atmosphere.photons=2e4", "seed=2010"]
 FRAME += ["detector.pixels_across_pupil=45", "detector.window_pixels=64", "simulation.light_oversampling=4"]

@@ -95,7 +95,7 @@ def _write(running: Loop, out: Path, state: LoopState, records: list[Record], ma
     folder_of.write_telemetry(out, running, state, records, stamp)
     if int(state.image.exposures):
         folder_of.write_image(out, state, stamp)
-    draw_loop(out / folder_of.PICTURE, running, state, records)
+    draw_loop(out / folder_of.PICTURE, running, state, records, floor_nm=numbers["bounds"]["floor_nm"])
     return numbers
 
 

@@ -84,6 +84,11 @@ class Detector(eqx.Module):
         return self.settings.quantum_efficiency * photons + self.background_electrons
 
     @property
+    def variance_without_light(self) -> float:
+        """Variance of a pixel that gets no light, electrons before multiplication, squared."""
+        return self.settings.read_noise_electrons**2 / self.settings.em_gain**2 + self.background_electrons
+
+    @property
     def background_electrons(self) -> float:
         """Mean electrons of a pixel without starlight; subtract them to see the star alone."""
         return self.settings.quantum_efficiency * self.settings.background_photons + self.settings.dark_electrons

@@ -13,6 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from nlcwfs.config import Config, digest, to_toml
+from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.errors import FileFormatError
 from nlcwfs.interop.atomic_write import atomic_write
 from nlcwfs.interop.provenance import Provenance
@@ -28,7 +29,6 @@ CONFIG, SUMMARY, TELEMETRY, RECORDS, IMAGE, CHECKPOINT, PICTURE = (
     "checkpoint.pickle",
     "loop.png",
 )
-ARCSEC = 180 / np.pi * 3600
 
 
 def prepare_folder(folder: Path, config: Config, *, resume: bool) -> None:
@@ -94,7 +94,7 @@ def write_image(folder: Path, state: LoopState, stamp: Provenance) -> None:
     hdu = fits.PrimaryHDU(np.asarray(image.image, np.float32))
     hdu.header["BUNIT"] = ("peak", "peak of a perfect telescope")
     hdu.header["WAVELEN"] = (image.wavelength_m, "[m] wavelength of the image")
-    hdu.header["PIXSCALE"] = (image.angles.pixel_m * ARCSEC, "[arcsec] on the sky")
+    hdu.header["PIXSCALE"] = (image.angles.pixel_m / ARCSEC_RAD, "[arcsec] on the sky")
     hdu.header["STREHL"] = (float(image.strehl), "intensity on the axis")
     hdu.header["NEXP"] = (int(image.exposures), "moments that were added up")
     for key, value, comment in stamp.cards():

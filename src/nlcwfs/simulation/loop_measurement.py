@@ -1,5 +1,6 @@
 """What a sensor and its reconstructor make of an exposure in a loop: coefficients of the mirror's modes."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,13 +11,15 @@ from jaxtyping import Array, Bool, Float
 
 from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
+from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
-from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.resolution_level import sum_blocks
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
-from nlcwfs.simulation.exposure import Exposure, distances_m, wavelength_m
+from nlcwfs.simulation.exposure import Exposure
+from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.loop_light import LoopLight
 from nlcwfs.simulation.loop_sight import Cautious, PixelModes, Sight
 
@@ -71,7 +74,7 @@ class FollowedCurvature(eqx.Module):
         Raises:
             SettingsError: If settings contradict each other.
         """
-        still, geometry = light.still, loop_geometry(config, light)
+        still, geometry = light.still, geometry_of(config, light.still)
         settings = config.estimation
         if settings.prior.wind_speed_m_per_s == type(settings.prior)().wind_speed_m_per_s:
             speed = max(config.atmosphere.wind_speeds_m_per_s)
@@ -87,11 +90,13 @@ class FollowedCurvature(eqx.Module):
         rate_hz = light.sequence.rate_hz
         sequence = SequenceReconstructor.build(geometry, settings, interval_s=1 / rate_hz, photons=still.photons)
         level = sequence.solver.level
-        coarser = still.factor // level.oversampling
+        coarser, rest = divmod(still.factor, level.oversampling)
+        if rest:
+            rule = f"must be a multiple of estimation.map.oversampling ({level.oversampling}) in a loop"
+            raise SettingsError("simulation.light_oversampling", rule, still.factor)
         lit = np.asarray(level.light) > 0
         nearest = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
         corner = [(a * coarser - b) // 2 for a, b in zip(level.grid.shape, light.weights.shape, strict=True)]
-        camera = config.detector
         return cls(
             reconstructor=sequence,
             pixels=PixelModes.build(light),
@@ -99,7 +104,7 @@ class FollowedCurvature(eqx.Module):
             corner=(corner[0], corner[1]),
             nearest=(nearest[0], nearest[1]),
             coarser=coarser,
-            read_variance=camera.read_noise_electrons**2 / camera.em_gain**2 + still.detector.background_electrons,
+            read_variance=still.detector.variance_without_light,
             look_again_every=config.loop.look_again_every,
             weights=light.weights,
         )
@@ -108,34 +113,18 @@ class FollowedCurvature(eqx.Module):
         """A shape of the mirror on the model's grid, continued beyond the rim as it is there."""
         margins = [(corner, corner) for corner in self.corner]
         both = jnp.stack([jnp.pad(self.weights * mirror_m, margins), jnp.pad(self.weights, margins)])
-        rows, columns = (size // self.coarser for size in both.shape[1:])
-        summed = both.reshape(2, rows, self.coarser, columns, self.coarser).sum(axis=(2, 4))
+        summed = sum_blocks(both, self.coarser)
         mean_m = jnp.where(summed[1] > 0, summed[0] / jnp.where(summed[1] > 0, summed[1], 1), 0)
         return mean_m[self.nearest[0], self.nearest[1]]
 
     @eqx.filter_jit
-    def _started(
-        self, counts: Array, usable: Array, mirror_m: Array
+    def _looked(
+        self, how: Callable, counts: Array, usable: Array, mirror_m: Array, memory: tuple[Memory, ...]
     ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
+        """One of the ways of the reconstructor to look at a frame; the first needs no memory."""
         known_m, noise = -self.on_model(mirror_m), self.read_variance
-        estimate, memory = self.reconstructor.start(counts, usable, read_variance=noise, known_m=known_m)
-        return estimate, memory, self.pixels(estimate.opd_m)
-
-    @eqx.filter_jit
-    def _followed(
-        self, counts: Array, usable: Array, mirror_m: Array, memory: Memory
-    ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
-        known_m, noise = -self.on_model(mirror_m), self.read_variance
-        estimate, memory = self.reconstructor.follow(counts, usable, memory, read_variance=noise, known_m=known_m)
-        return estimate, memory, self.pixels(estimate.opd_m)
-
-    @eqx.filter_jit
-    def _again(
-        self, counts: Array, usable: Array, mirror_m: Array, memory: Memory
-    ) -> tuple[WavefrontEstimate, Memory, Float[Array, " mode"]]:
-        known_m, noise = -self.on_model(mirror_m), self.read_variance
-        estimate, memory = self.reconstructor.look_again(counts, usable, memory, read_variance=noise, known_m=known_m)
-        return estimate, memory, self.pixels(estimate.opd_m)
+        estimate, after = how(self.reconstructor, counts, usable, *memory, read_variance=noise, known_m=known_m)
+        return estimate, after, self.pixels(estimate.opd_m)
 
     def measure(
         self,
@@ -148,16 +137,17 @@ class FollowedCurvature(eqx.Module):
         state = memory or FollowedState(None, 0, 0, 0)
         counts = exposure.frames.electrons
         if state.memory is None or state.sure < SURE:
-            estimate, begun, residual_m = self._started(counts, usable, mirror_m)
+            estimate, begun, residual_m = self._looked(SequenceReconstructor.start, counts, usable, mirror_m, ())
             outcome = Outcome(int(estimate.outcome_code))
             sure = state.sure + 1 if outcome.succeeded else 0
             after = FollowedState(begun if outcome.succeeded else None, 0, 0, sure)
             return self._sight(estimate, residual_m, outcome, closed=sure >= SURE), after
-        estimate, followed, residual_m = self._followed(counts, usable, mirror_m, state.memory)
+        seen = counts, usable, mirror_m
+        estimate, followed, residual_m = self._looked(SequenceReconstructor.follow, *seen, (state.memory,))
         outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
         doubts, since = 0 if outcome.succeeded else state.doubts + 1, state.since + 1
         if outcome.succeeded and self.look_again_every and since >= self.look_again_every:
-            again, followed, residual_m = self._again(counts, usable, mirror_m, followed)
+            again, followed, residual_m = self._looked(SequenceReconstructor.look_again, *seen, (followed,))
             ffts, since = ffts + int(again.ffts), 0
         if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             followed = self.reconstructor.skip(state.memory)
@@ -185,17 +175,15 @@ class SingleFrames(eqx.Module):
         Raises:
             SettingsError: If settings contradict each other.
         """
-        geometry, settings, basis = loop_geometry(config, light), config.estimation, None
+        geometry, settings, basis = geometry_of(config, light.still), config.estimation, None
         if settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes":
             pupil = geometry.pupil.on(geometry.frame)
             basis = modal_basis(pupil, geometry.frame, diameter_m=geometry.pupil.diameter_m, count=settings.modes)
-        camera = config.detector
         return cls(
             reconstructor=build_reconstructor(geometry, settings, basis=basis),
             pixels=PixelModes.build(light),
             cautious=Cautious.build(config, np.asarray(light.mirror.cycles_per_aperture)),
-            read_variance=camera.read_noise_electrons**2 / camera.em_gain**2
-            + light.still.detector.background_electrons,
+            read_variance=light.still.detector.variance_without_light,
         )
 
     @eqx.filter_jit
@@ -243,14 +231,3 @@ def build_measurement(config: Config, light: LoopLight) -> Measurement:
     if config.estimation.method == "map" and config.loop.follow:
         return FollowedCurvature.build(config, light)
     return SingleFrames.build(config, light)
-
-
-def loop_geometry(config: Config, light: LoopLight) -> SensorGeometry:
-    """What the reconstructor knows of the sensor."""
-    return SensorGeometry(
-        pupil=light.still.shape,
-        frame=light.still.frame,
-        wavelength_m=wavelength_m(config),
-        distances_m=distances_m(config),
-        flux_fractions=config.curvature_sensor.flux_fractions,
-    )

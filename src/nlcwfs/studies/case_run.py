@@ -22,10 +22,11 @@ from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.simulation.exposure import ExposureSimulator, seeing_arcsec, turbulence, wavelength_m
+from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.score import wavefront_error_m
 from nlcwfs.studies.mode_calibration import GROUPS_CPA, ModeErrors
 from nlcwfs.studies.study_cases import Capture, Case
-from nlcwfs.studies.study_light import Light, Progress, Screen, geometry_of
+from nlcwfs.studies.study_light import Light, Progress, Screen
 from nlcwfs.studies.study_table import Row
 
 LOST_NM = 1e6
@@ -74,8 +75,7 @@ def build_solver(case: Case, config: Config) -> tuple[Reconstructor, Grid]:
 def run_case(case: Case, config: Config, capture: Capture, light: Light, progress: Progress) -> Row:
     """Reconstruct all the screens of a case and sum up."""
     solver, frame = build_solver(case, config)
-    camera = config.detector
-    read_variance = camera.read_noise_electrons**2 / camera.em_gain**2 + Detector(camera).background_electrons
+    read_variance = Detector(config.detector).variance_without_light
     modes = ModeErrors.of(solver) if isinstance(solver, MaximumAPosteriori) else None
 
     @eqx.filter_jit

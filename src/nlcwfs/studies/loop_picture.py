@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.interop.atomic_write import atomic_write
 from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
-from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from, loop_bounds
-
-ARCSEC = 180 / np.pi * 3600
+from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from
 
 
-def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record]) -> None:
+def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record], *, floor_nm: float) -> None:
     """Draw a run.
 
     Args:
@@ -20,14 +19,15 @@ def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record]) -
         loop: The loop.
         state: Where it ended.
         records: What was recorded.
+        floor_nm: Bound to draw beside the residual.
     """
-    told, bounds = LoopTelemetry.of(records), loop_bounds(loop.light)
+    told = LoopTelemetry.of(records)
     time_s = np.arange(len(records)) / loop.config.loop.rate_hz
     figure = Figure(figsize=(11, 7), layout="constrained")
     cells = figure.add_gridspec(2, 2, height_ratios=(1, 1.1), width_ratios=(1.3, 1))
     top, left, right = (figure.add_subplot(cells[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
     top.semilogy(time_s, told.rms_nm, color="black", lw=1, label="residual")
-    top.axhline(bounds["floor_nm"], color="gray", ls="--", lw=1, label="mirror, lag and quantum limit")
+    top.axhline(floor_nm, color="gray", ls="--", lw=1, label="mirror, lag and quantum limit")
     first = counted_from(loop, state)
     if first < len(records):
         top.axvspan(time_s[first], time_s[-1], color="tab:blue", alpha=0.08, label="counted")
@@ -43,7 +43,7 @@ def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record]) -
     left.legend(fontsize=8, ncols=2)
     image = np.asarray(state.image.image)
     if np.isfinite(image).all():
-        half = image.shape[0] / 2 * state.image.angles.pixel_m * ARCSEC
+        half = image.shape[0] / 2 * state.image.angles.pixel_m / ARCSEC_RAD
         shown = right.imshow(
             np.log10(np.maximum(image, 1e-6)), origin="lower", cmap="inferno", extent=(-half, half, -half, half)
         )

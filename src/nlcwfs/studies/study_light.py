@@ -14,8 +14,8 @@ from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
-from nlcwfs.estimation.sensor_geometry import SensorGeometry
-from nlcwfs.simulation.exposure import ExposureSimulator, _lit_part, distances_m, frame_key, wavelength_m
+from nlcwfs.simulation.exposure import ExposureSimulator, _lit_part, frame_key
+from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.studies.study_cases import Case
 
 Progress = Callable[[str, int, int], None]
@@ -85,17 +85,6 @@ def make_light(case: Case, config: Config, count: int, progress: Progress) -> Li
 def matched_model(config: Config, simulator: ExposureSimulator) -> CurvatureSensor:
     """The sensor on the grid of the reconstructor: the inverse crime, to show what it flatters."""
     return geometry_of(config, simulator).model(simulator.frame, dtype="float32")
-
-
-def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
-    """What the reconstructor knows of the sensor."""
-    return SensorGeometry(
-        pupil=simulator.shape,
-        frame=simulator.frame,
-        wavelength_m=wavelength_m(config),
-        distances_m=distances_m(config),
-        flux_fractions=config.curvature_sensor.flux_fractions,
-    )
 
 
 def light_kind(case: Case, config: Config) -> str:
