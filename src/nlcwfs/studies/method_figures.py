@@ -98,7 +98,7 @@ def draw_calibration(table: Sequence[Row]) -> Figure | None:
     for axes in (left, right):
         axes.axhline(1, color="gray", linewidth=1)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7.5, frameon=False)
+        axes.legend(fontsize=7.5, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     return figure
 
 
