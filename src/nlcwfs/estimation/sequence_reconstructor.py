@@ -17,9 +17,9 @@ from nlcwfs.estimation.frame_prediction import (
     unseen_share,
     wind_carriage,
 )
-from nlcwfs.estimation.map_solution import Task, searched
+from nlcwfs.estimation.map_solution import Task
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
-from nlcwfs.estimation.maximum_a_posteriori import START_NOISE, Found, MaximumAPosteriori
+from nlcwfs.estimation.maximum_a_posteriori import Found, MaximumAPosteriori
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS
 from nlcwfs.estimation.resolution_level import cropped
@@ -151,32 +151,6 @@ class SequenceReconstructor(eqx.Module):
         found = solver.found(near, mirror_rad=-rest_rad)
         memory = self._begun(found)
         return solver.account(found), dataclasses.replace(memory, slope=memory.slope - slope)
-
-    def look_again(
-        self,
-        counts: Float[Array, "plane y x"],
-        usable: Bool[Array, "plane y x"],
-        memory: Memory,
-        *,
-        read_variance: float | Float[Array, ""] = 0.0,
-        known_m: Float[Array, "Y X"] | None = None,
-    ) -> tuple[WavefrontEstimate, Memory]:
-        """A second, slow look at a frame that was followed: islands that came in over the rim are brought back.
-
-        As many FFTs as a frame on its own takes, without its first guess. The more likely wavefront is kept.
-        Arguments as for `follow`, but `memory` is what that has returned for this very frame.
-        """
-        solver, level, strength = self.solver, self.solver.level, memory.strength
-        measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
-        known_rad = solver.known_rad(memory.slope) + (0 if known_m is None else self._phase_of(known_m))
-        scale = solver.plane_scale(measured, known_rad + memory.phase_rad)
-        prior = solver.prior(solver.power * strength, solver.tilt_rms_rad * jnp.sqrt(strength))
-        task = solver.task(measured, known_rad, scale, prior, strength)
-        unknown = prior.start(memory.phase_rad, noise_variance=START_NOISE / task.problem.information)
-        none = jnp.asarray(0, jnp.int32)
-        found = Found(task, searched(task, solver.settings.map, unknown, (none, none)), memory.slope, strength)
-        again = dataclasses.replace(self._begun(found), surprise_rad2=memory.surprise_rad2)
-        return solver.account(found), again
 
     def _begun(self, found: Found) -> Memory:
         """What a frame on its own tells of the next."""

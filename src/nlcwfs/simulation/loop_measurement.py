@@ -15,6 +15,7 @@ from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.resolution_level import sum_blocks
+from nlcwfs.estimation.second_look import SecondLook
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
@@ -58,6 +59,7 @@ class FollowedCurvature(eqx.Module):
     """
 
     reconstructor: SequenceReconstructor
+    second: SecondLook
     pixels: PixelModes
     cautious: Cautious
     corner: tuple[int, int] = eqx.field(static=True)
@@ -99,6 +101,7 @@ class FollowedCurvature(eqx.Module):
         corner = [(a * coarser - b) // 2 for a, b in zip(level.grid.shape, light.weights.shape, strict=True)]
         return cls(
             reconstructor=sequence,
+            second=SecondLook.build(sequence),
             pixels=PixelModes.build(light),
             cautious=Cautious.build(config, np.asarray(light.mirror.cycles_per_aperture)),
             corner=(corner[0], corner[1]),
@@ -126,6 +129,12 @@ class FollowedCurvature(eqx.Module):
         estimate, after = how(self.reconstructor, counts, usable, *memory, read_variance=noise, known_m=known_m)
         return estimate, after, self.pixels(estimate.opd_m)
 
+    @eqx.filter_jit
+    def _change_m(self, change_rad: Float[Array, "Y X"]) -> Float[Array, " mode"]:
+        """What a change of the phase on the model's grid is in modes."""
+        solver = self.reconstructor.solver
+        return self.pixels(solver.on_frame(change_rad) * (solver.geometry.wavelength_m / (2 * np.pi)))
+
     def measure(
         self,
         exposure: Exposure,
@@ -147,8 +156,11 @@ class FollowedCurvature(eqx.Module):
         outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
         doubts, since = 0 if outcome.succeeded else state.doubts + 1, state.since + 1
         if outcome.succeeded and self.look_again_every and since >= self.look_again_every:
-            again, followed, residual_m = self._looked(SequenceReconstructor.look_again, *seen, (followed,))
-            ffts, since = ffts + int(again.ffts), 0
+            known_m, noise = -self.on_model(mirror_m), self.read_variance
+            looked = self.second.look(counts, usable, followed, read_variance=noise, known_m=known_m)
+            followed, ffts, since = looked.memory, ffts + looked.ffts, 0
+            if looked.turned:
+                residual_m = residual_m + self._change_m(looked.change_rad)
         if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             followed = self.reconstructor.skip(state.memory)
         lost = doubts >= DOUBTS
