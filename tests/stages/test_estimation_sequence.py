@@ -15,12 +15,15 @@ import pytest
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.errors import SettingsError
+from nlcwfs.estimation import second_look
 from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.second_look import SecondLook
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.sequence_budget import fixed_ffts, inner_steps
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.turned_regions import TurnedRegion
 
 DIAMETER_M, PIXEL_M, WAVELENGTH_M = 8.0, 0.25, 0.65e-6
 DISTANCES_M = (-3.5e6, -2.5e6, 2.6e6, 3.3e6)
@@ -205,6 +208,76 @@ def test_light_of_other_air_is_not_believed(stream):
     other = jnp.asarray(exposure(1.5 * np.roll(air(), 256, axis=0)[: FINE[0], : FINE[1]], seed=71))
     estimate, _ = stream.follow(other, stream.alone[0][1], stream.flat_m)
     assert estimate.outcome is Outcome.NOT_EXPLAINED
+
+
+# ---------------------------------------------------------------------------------------- the second look
+
+
+Y_M, X_M = np.meshgrid(*(centres(n, PIXEL_M) for n in FRAME), indexing="ij")
+
+
+def planted(memory, middle_m: tuple[float, float], radius_m: float, turns: float):
+    """The same memory with a disc of the phase some turns off, its rim two cells wide."""
+    away_m = np.hypot(Y_M - middle_m[0], X_M - middle_m[1])
+    island_rad = 2 * np.pi * turns / (1 + np.exp((away_m - radius_m) / (0.4 * PIXEL_M)))
+    return eqx.tree_at(
+        lambda one: one.phase_rad, memory, memory.phase_rad + jnp.asarray(island_rad, memory.phase_rad.dtype)
+    )
+
+
+@pytest.mark.parametrize(
+    ("middle_m", "radius_m", "turns"), [((1.2, -3.4), 1.1, 1), ((-3.0, 2.0), 0.9, -1), ((0.8, -0.4), 1.0, 1)]
+)
+def test_an_island_at_the_rim_or_within_is_brought_back(stream, middle_m, radius_m, turns):
+    memory, look = stream.alone[1][1], SecondLook.build(stream.sequence)
+    wrong = planted(memory, middle_m, radius_m, turns)
+    looked = look.look(stream.frames[1], USABLE, wrong)
+    assert looked.turned == 1
+    slope_m = np.asarray(memory.slope[0]) * Y_M + np.asarray(memory.slope[1]) * X_M
+    before, planted_nm, after = (
+        error_nm(np.asarray(one.phase_rad) * METRES + slope_m, truth_rad(1)) for one in (memory, wrong, looked.memory)
+    )
+    assert planted_nm > 8 * before  # it was worth it
+    assert after < 1.2 * before  # measured 1.01
+    off = np.asarray(looked.memory.phase_rad - wrong.phase_rad - looked.change_rad)
+    assert abs(off).max() < 1e-4
+
+
+def test_two_islands_of_unlike_signs_are_brought_back_behind_a_mirror(stream):
+    """The mirror's shape is part of what the light has met; told with the wrong sign nothing fits."""
+    y_m, x_m = np.meshgrid(*(centres(n, PIXEL_M / FINER) / 4 for n in FINE), indexing="ij")
+    mirror_rad = 1.0 * x_m * y_m + 1.5 * (x_m**2 - 0.5 * y_m**2) + y_m**3 - 0.7 * x_m
+    known_m = jnp.asarray(-on_pixels(mirror_rad) / FINER**2 * METRES)
+    counts = jnp.asarray(exposure(truth_rad(1) - mirror_rad, seed=70))
+    memory = stream.follow(counts, stream.alone[0][1], known_m)[1]
+    wrong = planted(planted(memory, (1.2, -3.4), 1.1, 1), (-3.0, 2.0), 0.9, -1)
+    looked = SecondLook.build(stream.sequence).look(counts, USABLE, wrong, known_m=known_m)
+    assert looked.turned == 2
+    slope_m = np.asarray(memory.slope[0]) * Y_M + np.asarray(memory.slope[1]) * X_M
+    before, after = (
+        error_nm(np.asarray(one.phase_rad) * METRES + slope_m, truth_rad(1)) for one in (memory, looked.memory)
+    )
+    assert after < 1.2 * before
+
+
+def test_a_wavefront_without_islands_stays_as_it_is(stream):
+    look = SecondLook.build(stream.sequence)
+    for number in range(1, 4):
+        memory = stream.alone[number][1]
+        looked = look.look(stream.frames[number], USABLE, memory)
+        assert looked.turned == 0
+        assert np.array_equal(looked.memory.phase_rad, memory.phase_rad)
+        assert looked.ffts >= 240  # 15 iterations of 16
+
+
+def test_a_region_that_the_light_does_not_want_moved_stays(stream, monkeypatch):
+    """Whatever is proposed, the likelihood and the prior decide."""
+    look, memory = SecondLook.build(stream.sequence), stream.alone[1][1]
+    region = TurnedRegion(np.hypot(Y_M - 1.2, X_M + 2.4) < 1.0, 1)
+    monkeypatch.setattr(second_look, "turned_regions", lambda *_, **__: [region])
+    looked = look.look(stream.frames[1], USABLE, memory)
+    assert (looked.turned, float(abs(looked.change_rad).max())) == (0, 0.0)
+    assert looked.ffts > 240
 
 
 # -------------------------------------------------------------------------------------------- the budget

@@ -29,8 +29,9 @@ TEARING = 15
 TEARING_GAIN = 1.0
 """Length of their steps. Gerchberg and Saxton's own: with twice that, noise hides every third island."""
 
-EASES = (1.0, 0.8)
-"""See `turned_regions`. With the second nearly every island is among the regions, and as many that are none."""
+EASES = (0.9, 0.75)
+"""See `turned_regions`. Of 12 islands in loops the first names 10 and nothing else, the second 11 and as many that are
+none; 1 names 7."""
 
 MOST = 6
 """Regions that are asked about in one look."""
@@ -43,6 +44,10 @@ REACH = 8
 
 BLUR = 1.0
 """Width of the soft rim of a moved region, cells."""
+
+
+AROUND = 4
+"""Cells around a region in which the light of the frame sets the phase, so that the rim is mended, too."""
 
 
 class Looked(NamedTuple):
@@ -105,9 +110,9 @@ class SecondLook(eqx.Module):
         change_rad, turned = jnp.zeros_like(memory.phase_rad), 0
         if not regions:
             return Looked(memory, change_rad, turned, int(ffts))
-        first = best = self._solved(*seen, memory, change_rad)
+        best = self._solved(*seen, memory, change_rad)
         moved_rad = np.zeros(self.lit.shape)
-        ffts = ffts + first[1].ffts
+        ffts = ffts + best[1].ffts
         for region in regions:
             tried_rad = moved_rad + self._move_rad(region)
             found = self._solved(*seen, memory, jnp.asarray(tried_rad, change_rad.dtype))
@@ -115,7 +120,9 @@ class SecondLook(eqx.Module):
             if float(found[1].cost) < float(best[1].cost) - EVIDENCE:
                 best, moved_rad, turned = found, tried_rad, turned + 1
         if turned:
-            change_rad = best[0] - first[0]
+            # Elsewhere what is followed knows more than this one frame.
+            around = jnp.asarray(_around(moved_rad), change_rad.dtype)
+            change_rad = around * (best[0] - memory.phase_rad)
         after = eqx.tree_at(lambda one: one.phase_rad, memory, memory.phase_rad + change_rad)
         return Looked(after, change_rad, turned, int(ffts))
 
@@ -176,3 +183,9 @@ class SecondLook(eqx.Module):
         start = task.problem.prior.start(memory.phase_rad + move_rad, noise_variance=noise)
         solution = solved(task, self.sequence.solver.settings.map, start, (none, none))
         return task.problem.prior.phase_rad(solution.unknown), solution
+
+
+def _around(moved_rad: np.ndarray) -> np.ndarray:
+    """1 where the phase was moved and somewhat around, softly 0 beyond."""
+    near = scipy.ndimage.distance_transform_edt(abs(moved_rad) < np.pi) <= AROUND
+    return scipy.ndimage.gaussian_filter(near.astype(float), BLUR)

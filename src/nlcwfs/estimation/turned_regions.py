@@ -14,6 +14,12 @@ NEIGHBOURS = ((1, 0, 1.0), (0, 1, 1.0), (1, 1, 0.5), (1, -1, 0.5))
 CAPACITY = 100
 """Steps of one rad^2 in the capacities, which the search for the cheapest cut wants as whole numbers."""
 
+LOCAL_CELLS = 5.0
+"""Slopes wider than this are taken out first, so that long cuts along a steep slope of the turbulence are not cheap."""
+
+ROUNDS = 3
+"""Moves by one turn in a row: one of them cannot bring back islands that are too high and too low."""
+
 SMALLEST = 8
 """Cells of the smallest region that is worth a look."""
 
@@ -23,7 +29,7 @@ class TurnedRegion(NamedTuple):
 
     Attributes:
         cells: Where.
-        turns: 1 or -1: what brings them back.
+        turns: How many more, positive or negative, bring them back.
     """
 
     cells: Bool[np.ndarray, "y x"]
@@ -35,7 +41,7 @@ def turned_regions(
 ) -> list[TurnedRegion]:
     r"""Connected regions whose move by a turn makes neighbours more alike, the largest first; the main one stays.
 
-    Of all ways to move cells by one turn the one with the least :math:`\sum w\,(\phi_p - \phi_q)^2` over neighbours,
+    Of all ways to move cells by one turn, one after the other, that with the least :math:`\sum w\,(\phi_p - \phi_q)^2` over neighbours,
     exactly, as the minimum cut of a graph (Bioucas-Dias & Valadao 2007, IEEE Trans. Image Process. 16, 698).
 
     Args:
@@ -44,18 +50,33 @@ def turned_regions(
         ease: Below 1 a rim costs less than it should, and regions are found that are only perhaps turned.
 
     Examples:
-        >>> phase_rad = np.zeros((12, 12))
+        >>> phase_rad = np.zeros((16, 16))
         >>> phase_rad[:4, 3:8] += 6.0
-        >>> [(int(one.cells.sum()), one.turns) for one in turned_regions(phase_rad, np.ones((12, 12), bool))]
+        >>> [(int(one.cells.sum()), one.turns) for one in turned_regions(phase_rad, np.ones((16, 16), bool))]
         [(20, -1)]
     """
-    moved = _cheapest_move(np.asarray(phase_rad, float), lit, ease)
+    local_rad = _local(np.asarray(phase_rad, float), lit)
+    turns = np.zeros(lit.shape, int)
+    for _ in range(ROUNDS):
+        moved = _cheapest_move(local_rad + 2 * np.pi * turns, lit, ease)
+        if moved.all(where=lit) or not moved.any():
+            break
+        turns += moved
     parts = []
-    for where, turns in ((moved & lit, 1), (~moved & lit, -1)):
-        labels, count = scipy.ndimage.label(where)
-        parts += [TurnedRegion(labels == label, turns) for label in range(1, count + 1)]
+    for turn in np.unique(turns[lit]):
+        labels, count = scipy.ndimage.label(lit & (turns == turn))
+        parts += [TurnedRegion(labels == label, int(turn)) for label in range(1, count + 1)]
     parts.sort(key=lambda part: -int(part.cells.sum()))
-    return [part for part in parts[1:] if part.cells.sum() >= SMALLEST]
+    still = parts[0].turns
+    others = [TurnedRegion(part.cells, part.turns - still) for part in parts[1:]]
+    return [part for part in others if part.turns and part.cells.sum() >= SMALLEST]
+
+
+def _local(phase_rad: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """The phase without its mean over the surroundings."""
+    inside = np.where(lit, phase_rad, 0)
+    sums = [scipy.ndimage.gaussian_filter(part, LOCAL_CELLS) for part in (inside, lit.astype(float))]
+    return np.where(lit, inside - sums[0] / np.where(lit, sums[1], 1), 0)
 
 
 def _cheapest_move(phase_rad: np.ndarray, lit: np.ndarray, ease: float) -> np.ndarray:
