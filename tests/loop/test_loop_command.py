@@ -121,9 +121,24 @@ def test_a_star_too_faint_ends_with_one(tmp_path):
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["rms_nm"] is None
 
 
+def test_a_star_is_told_by_its_magnitude(tmp_path):
+    """Bessell's 3636 Jy at 0.545 um over h: 1.007e11 photons / s / m^2 / um of magnitude 0; 2 m, half obstructed."""
+    star = ["atmosphere.photons_per_s=", "atmosphere.star.magnitude=10", "atmosphere.star.throughput=0.3"]
+    fast = ["loop.sensor=ideal", "loop.seconds=0.02", "loop.settle_s=0", "beam.obstruction_ratio=0.5"]
+    result = typed(tmp_path / "run", settings=[*star, *fast])
+    assert result.exit_code == 0
+    numbers = json.loads((tmp_path / "run" / "summary.json").read_text())
+    expected = 1.0069e11 * 1e-4 * 0.5 * 0.3 * np.pi * 0.75
+    assert numbers["magnitude"] == 10
+    assert numbers["photons_per_s"] == pytest.approx(expected, rel=1e-3)
+    assert numbers["photons_per_frame"] == pytest.approx(expected / 500, rel=1e-3)
+    assert f"Star of magnitude 10: {expected:.3g} photons a second" in result.output
+
+
 @pytest.mark.parametrize(
     ("setting", "rule"),
     [
+        ("atmosphere.star.magnitude=13", "atmosphere.photons_per_s: must be left out with atmosphere.star.magnitude"),
         ("atmosphere.photons_per_s=0", "atmosphere.photons_per_s: must be"),
         ("loop.rate_hz=2", "loop.rate_hz: must be higher"),
         ("feedback.gain=3", "feedback.gain: must be"),

@@ -174,6 +174,17 @@ def test_a_rate_without_a_sequence_is_refused(tmp_path):
     assert result.stderr == "nlcwfs: --rate: must come with --sequence, got 100 without\n"
 
 
+def test_a_star_shines_into_a_sequence_and_not_into_single_exposures(tmp_path):
+    star = {"atmosphere__photons_per_s": 5e6}
+    sequence = small_sequence(tmp_path / "s.fits", 250, **star)
+    assert fits.getheader(tmp_path / "s.fits")["PHOTONS"] == pytest.approx(5e6 / 250)
+    assert "Light: 20000 photons in one exposure" in sequence.stdout
+    assert "has no length" not in sequence.stderr
+    single = small_frames(tmp_path / "f.fits", **star, atmosphere__photons=3e4)
+    assert fits.getheader(tmp_path / "f.fits")["PHOTONS"] == pytest.approx(3e4)
+    assert "A single exposure has no length: atmosphere.photons rules" in single.stderr
+
+
 def test_wind_that_is_default_is_not_in_the_fingerprint_and_any_other_is():
     # Fingerprints that were taken before there was wind still hold.
     assert not {"layer_fractions", "screen_width_m"} & set(AtmosphereSettings().model_dump())

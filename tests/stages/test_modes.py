@@ -6,6 +6,7 @@ import pytest
 
 from nlcwfs.beam.disc_harmonics import modes_up_to
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.mirror_images import Quarter
 from nlcwfs.beam.modes import modal_basis
 from nlcwfs.beam.pupil import Spiders, circular_pupil, pupil_of_discs
 from nlcwfs.errors import SamplingError, SettingsError
@@ -173,3 +174,44 @@ def test_the_number_of_disc_modes_follows_the_law_of_weyl(cycles):
     weyl = (np.pi * cycles) ** 2 / 4 + np.pi * cycles / 2
     # 2 sqrt(k R): the known size of the ripple about Weyl's law for a disc.
     assert abs(modes_up_to(cycles) - weyl) < 2 * np.sqrt(np.pi * cycles)
+
+
+def annulus(shape):
+    grid = Grid(shape, 0.5)
+    return circular_pupil(grid, diameter_m=7.5, obstruction_ratio=0.3), grid
+
+
+def slanted(shape):
+    grid = Grid(shape, 0.5)
+    return circular_pupil(grid, diameter_m=7.5, spiders=Spiders((20.0, 110.0), 0.4)), grid
+
+
+@pytest.mark.parametrize("telescope", [annulus, slanted])
+@pytest.mark.parametrize("shape", [(16, 17), (17, 18), (19, 19), (16, 16)])
+def test_turbulence_excites_the_modes_independently(telescope, shape):
+    """The double sum over all pairs of pixels, of a symmetric pupil too, of which the code sums a quarter."""
+    pupil, grid = telescope(shape)
+    basis = modal_basis(pupil, grid, diameter_m=7.5, count=60)
+    lit = np.asarray(basis.weights) > 0
+    y, x = (axis[lit] / 7.5 for axis in np.broadcast_arrays(grid.y_m, grid.x_m))
+    apart = np.hypot(y[:, None] - y, 1.001 * (x[:, None] - x))  # the twins are told apart, see `modes`
+    structure = 6.8839 * apart ** (5 / 3)  # Fried 1965
+    weighted = np.asarray(basis.modes)[:, lit] * np.asarray(basis.weights)[lit]
+    covariance = -weighted @ structure @ weighted.T / 2
+    expected = np.diag(basis.kolmogorov_rad2)
+    # 1e-5: digits of Fried's constant; between modes rounding alone, against a tilt of 0.45 rad^2.
+    np.testing.assert_allclose(np.diag(covariance), np.diag(expected), rtol=1e-5)
+    np.testing.assert_allclose(covariance - np.diag(np.diag(covariance)), 0, atol=1e-12)
+
+
+def test_a_quarter_stands_for_a_pupil_that_is_symmetric_and_only_for_that():
+    pupil, grid = annulus((18, 19))
+    folded = Quarter.of(pupil**2, grid)
+    assert folded.folded
+    assert folded.times.sum() == np.sum(pupil > 0)
+    assert not Quarter.of(slanted((18, 19))[0], grid).folded
+    dimmer = pupil**2
+    dimmer[4, 9] *= 0.99
+    assert not Quarter.of(dimmer, grid).folded
+    upside_down = pupil[::-1] * np.linspace(1, 2, 19)  # symmetric along y alone
+    assert not Quarter.of(upside_down, grid).folded

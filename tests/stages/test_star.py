@@ -1,11 +1,16 @@
 """Stars in photons a second, against numbers worked out by hand and those of the field."""
 
 import itertools
+from typing import get_args
 
 import pytest
 
+from nlcwfs.atmosphere.settings import AtmosphereSettings, StarSettings
 from nlcwfs.atmosphere.star import BANDS, collecting_area_m2, photons_per_s
+from nlcwfs.config import Config, digest, load_config
+from nlcwfs.config_messages import ConfigError
 from nlcwfs.errors import SettingsError
+from nlcwfs.simulation.starlight import starlight_per_s, with_exposures_of
 
 # f_lambda of magnitude 0 in 1e-8 W / m^2 / um (Bessell, Castelli & Plez 1998, table A2): the same zero points, quoted
 # per wavelength.
@@ -85,4 +90,56 @@ def test_bad_numbers_give_one_line(changes, line):
 def test_a_telescope_that_cannot_be_is_refused(shape, line):
     with pytest.raises(SettingsError) as error:
         collecting_area_m2(**shape)
+    assert str(error.value) == line
+
+
+def test_settings_know_every_band():
+    (allowed,) = (one for one in get_args(StarSettings.model_fields["band"].annotation) if one is not type(None))
+    assert set(get_args(allowed)) == set(BANDS)
+
+
+def test_what_is_left_out_is_the_star_of_the_paper():
+    """3.2e6 photons a second from m_V 13 on 8 m (Guyon 2010, Fig. 5); 2 %: its zero point and two digits."""
+    config = load_config(None, ["atmosphere.star.magnitude=13"])
+    assert starlight_per_s(config) == pytest.approx(3.2e6, rel=0.02)
+    assert with_exposures_of(config, 250.0).atmosphere.photons == pytest.approx(3.2e6 / 250, rel=0.02)
+
+
+def test_a_number_of_photons_stays_itself():
+    assert starlight_per_s(Config()) is None
+    assert with_exposures_of(Config(), 50.0) == Config()
+    assert starlight_per_s(load_config(None, ["atmosphere.photons_per_s=7e5"])) == 7e5
+
+
+def test_a_star_that_is_not_told_is_not_in_the_fingerprint():
+    assert "star" not in AtmosphereSettings().model_dump()
+    assert digest(Config()) == "03173d015beb6b82"  # as it was before there were stars
+    for change in ("atmosphere.star.magnitude=13", "atmosphere.star={magnitude=13, band='R'}"):
+        changed = load_config(None, [change])
+        assert digest(changed) != digest(Config())
+        assert Config.model_validate(changed.model_dump()) == changed
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (
+            ["atmosphere.star.magnitude=13", "atmosphere.photons_per_s=3e6"],
+            "atmosphere.photons_per_s: must be left out with atmosphere.star.magnitude, which rules instead, "
+            "got 3000000.0",
+        ),
+        (["atmosphere.star.magnitude=99"], "atmosphere.star.magnitude: must be a number from -30 to 60, got 99"),
+        (
+            ["atmosphere.star.magnitude=3", "atmosphere.star.band=Z"],
+            'atmosphere.star.band: must be "U", "B", "V", "R", "I", "J", "H" or "K", got "Z"',
+        ),
+        (
+            ["atmosphere.star.magnitude=3", "atmosphere.star.throughput=2"],
+            "atmosphere.star.throughput: must be a number greater than 0 and at most 1, got 2",
+        ),
+    ],
+)
+def test_a_star_that_cannot_be_is_told_in_a_line(overrides, line):
+    with pytest.raises(ConfigError) as error:
+        load_config(None, overrides)
     assert str(error.value) == line

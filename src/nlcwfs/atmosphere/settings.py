@@ -1,11 +1,65 @@
 """What a user may choose about the star and the air."""
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
 
-_OF_A_SEQUENCE = ("layer_fractions", "wind_speeds_m_per_s", "wind_directions_deg", "screen_width_m", "photons_per_s")
+_OF_A_SEQUENCE = (
+    "layer_fractions",
+    "wind_speeds_m_per_s",
+    "wind_directions_deg",
+    "screen_width_m",
+    "photons_per_s",
+    "star",
+)
+
+
+class StarSettings(BaseModel):
+    """A star of a magnitude, instead of a number of photons; for sequences and loops, whose exposures have a length.
+
+    Without a magnitude the other keys do nothing.
+
+    Examples:
+        >>> StarSettings(magnitude=13.0, band="R").light
+        ('R', 0.2, 0.5)
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    magnitude: float | None = Field(
+        default=None,
+        ge=-30,
+        le=60,
+        examples=[13.0],
+        description="apparent magnitude on Vega's scale; when given it rules instead of photons",
+    )
+    band: Literal["U", "B", "V", "R", "I", "J", "H", "K"] | None = Field(
+        default=None,
+        examples=["V"],
+        description="band of the magnitude, whose photons for each um count; leave out for V",
+    )
+    throughput: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        examples=[0.2],
+        description="share of the photons that reach the detector through air and optics, its quantum efficiency not "
+        "counted; leave out for 0.2, as in Guyon 2010",
+    )
+    bandwidth_um: float | None = Field(
+        default=None,
+        gt=0,
+        le=10,
+        examples=[0.5],
+        description="width of the light that the sensor uses; leave out for 0.5, as in Guyon 2010",
+    )
+
+    @property
+    def light(self) -> tuple[str, float, float]:
+        """Band, throughput, bandwidth in um; what is left out is as in Guyon 2010: V 13 sends 3.2e6 photons a second."""
+        throughput = 0.2 if self.throughput is None else self.throughput
+        return self.band or "V", throughput, 0.5 if self.bandwidth_um is None else self.bandwidth_um
 
 
 class AtmosphereSettings(BaseModel):
@@ -22,7 +76,8 @@ class AtmosphereSettings(BaseModel):
         default=None,
         gt=0,
         examples=[3e6],
-        description="photons that the whole sensor gets in a second of a loop; when given it rules instead of photons",
+        description="photons that the whole sensor gets in a second of a loop or a sequence; when given it rules "
+        "instead of photons",
     )
     seeing_arcsec: float = Field(
         default=0.6, gt=0, le=10, description="full width at half maximum of a long exposure at 0.5 um"
@@ -58,6 +113,14 @@ class AtmosphereSettings(BaseModel):
         description="width of the air that the wind carries past, after which it repeats; leave out for 12 telescopes",
     )
 
+    star: StarSettings = Field(default_factory=StarSettings)
+
+    @model_validator(mode="after")
+    def _light_is_told_once(self) -> "AtmosphereSettings":
+        if self.photons_per_s is not None and self.star.magnitude is not None:
+            raise ValueError("photons_per_s must be left out with atmosphere.star.magnitude, which rules instead")
+        return self
+
     @model_validator(mode="after")
     def _layers_agree(self) -> "AtmosphereSettings":
         layers = len(self.layer_fractions)
@@ -72,5 +135,9 @@ class AtmosphereSettings(BaseModel):
     def _without_wind_that_is_default(self, write: Callable[["AtmosphereSettings"], dict[str, Any]]) -> dict[str, Any]:
         """Keep the fingerprint of single exposures, which know no wind, as it was before there was one."""
         values, fields = write(self), type(self).model_fields
-        unused = {name for name in _OF_A_SEQUENCE if getattr(self, name) == fields[name].default}
+        unused = {
+            name
+            for name in _OF_A_SEQUENCE
+            if getattr(self, name) == fields[name].get_default(call_default_factory=True)
+        }
         return {name: value for name, value in values.items() if name not in unused}

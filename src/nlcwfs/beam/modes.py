@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nlcwfs.beam.disc_harmonics import orthonormal_shells, sample_waves
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.modal_pool import Pool, cleaned, orthonormal_pool
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.errors import SamplingError, SettingsError
 
@@ -22,6 +22,9 @@ KOLMOGOROV_SPECTRUM = 0.0229
 
 DIM = 0.1
 """Rim pixels below this amplitude carry no mode: 1e-4 of the light, but modes would grow wild there."""
+
+FEW = 8
+"""Waves that are transformed at a time: what fits into the cache of a processor."""
 
 
 class ModalBasis(eqx.Module):
@@ -110,9 +113,10 @@ def modal_basis(
     first. Piston of the whole pupil is left out.
 
     Measured, 820 modes on 45 and 90 pixels: condition of the waves 1.5 and 1.1 on a circle, 5e6 and 2e6 with
-    an obstruction of 0.3 and vanes, 9e5 and 5e4 on seven segments, 9e14 on four separate discs (90 pixels);
-    of the modes always 1 + 1e-14. Built in 1.4 s and 4.6 s on one core (run BLAS on one thread when others
-    compute). A circle has 648 and 645 modes up to 16 cycles per aperture, of disc harmonics 655.
+    an obstruction of 0.3 and vanes, 9e5 and 5e4 on seven segments, more than 6e7 (all that double precision
+    tells) on four separate discs; of the modes always 1 + 1e-13. Built in 0.7 s and 1.4 s on one core (run BLAS on
+    one thread when others compute), in up to three times as long on a pupil that is not its own mirror image. A
+    circle has 648 and 645 modes up to 16 cycles per aperture, of disc harmonics 655.
 
     Why Karhunen-Loeve is the default: the part of Kolmogorov turbulence left by 2, 20, 200 and 820 modes on
     45 pixels, in rad^2 for D / r0 = 1, is 0.1323, 0.0176, 0.0023, 0.0005, within 1 % of the best that any
@@ -139,77 +143,67 @@ def modal_basis(
     if count < 1:
         raise SettingsError("modes.count", "must be at least 1", count)
     weights = light_weights(np.where(pupil < DIM, 0, pupil))
-    lit = weights > 0
-    root = np.sqrt(weights[lit])
     # Karhunen-Loeve modes need waves beyond the last one: 15 % and 20 more are worth less than 1 % of it.
     enough = count + 1 + (math.ceil(0.15 * count) + 20 if kind == "karhunen-loeve" else 0)
-    columns, cycles, raw_condition = _orthonormal_pool(grid, lit, root, diameter_m, enough)
-    if columns.shape[1] < count:
-        rule = f"must be at most {columns.shape[1]}, what {root.size} lit pixels carry"
+    pool, raw_condition = orthonormal_pool(grid, weights, diameter_m, enough)
+    if len(pool.rows) < count:
+        rule = f"must be at most {len(pool.rows)}, what {np.sum(weights > 0)} lit pixels carry"
         raise SamplingError("modes.count", f"{rule} below half a cycle per pixel", count)
-    covariance = _kolmogorov_covariance(columns, lit, root, grid.pixel_m / diameter_m)
+    pool, condition = cleaned(pool)
+    cycles, pixel = pool.cycles, grid.pixel_m / diameter_m
+    covariance = _kolmogorov_covariance(pool, pixel)
     if kind == "karhunen-loeve":
-        variance, rotation = np.linalg.eigh(covariance)
-        variance, rotation = variance[::-1], rotation[:, ::-1]
-        strongest = np.take_along_axis(rotation, np.argmax(np.abs(rotation), axis=0)[None, :], axis=0)
-        columns = columns @ (rotation * np.sign(strongest))
-        cycles = _cycles_of_variance(variance, root, grid.pixel_m / diameter_m)
+        pool, variance = _independent(pool, covariance)
+        cycles = _cycles_of_variance(variance, weights, pixel)
     else:
         variance = np.diag(covariance)
-    columns = columns[:, :count]
     modes = np.zeros((count, *weights.shape))
-    modes[:, lit] = (columns / root[:, None]).T
-    spread = np.linalg.eigvalsh(columns.T @ columns)
-    condition = float(np.sqrt(spread[-1] / spread[0]))
-    total = _kolmogorov_total(weights, grid.pixel_m / diameter_m)
+    for each in np.unique(pool.kinds[:count]).tolist():
+        chosen = np.flatnonzero(pool.kinds[:count] == each)
+        modes[chosen] = pool.quarter.images(pool.rows[chosen] / pool.root, each)
+    total = _kolmogorov_total(weights, pixel)
     return ModalBasis(modes, weights, cycles[:count], variance[:count], total, raw_condition, condition)
 
 
-def _orthonormal_pool(
-    grid: Grid, lit: np.ndarray, root: np.ndarray, diameter_m: float, enough: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Columns `sqrt(weight) * mode`, orthonormal, without piston; cycles per aperture; raw condition."""
-    y_m, x_m = (axis[lit] for axis in np.broadcast_arrays(grid.y_m, grid.x_m))
-    radius_m = max(diameter_m / 2, float(np.hypot(y_m, x_m).max()) - grid.pixel_m)
-    finest = math.pi * radius_m / grid.pixel_m  # k R of half a cycle per pixel
-    # Weyl: the lit area A carries A k^2 / (4 pi) waves, less at its edges; 40 more cover the low end.
-    light_area_m2 = grid.pixel_m**2 * root.size
-    wanted = math.sqrt(4 * math.pi * (1.1 * enough + 40) / light_area_m2) * radius_m
-    while True:
-        waves, numbers = sample_waves(grid, lit, radius_m=radius_m, largest=min(wanted, finest))
-        waves = waves * root[:, None]
-        slow = np.stack([np.ones_like(x_m), x_m, y_m], axis=1) * root[:, None]
-        start, corner = np.linalg.qr(slow)
-        columns, found = orthonormal_shells(start * np.sign(np.diag(corner)), waves, numbers, enough=enough)
-        if columns.shape[1] >= enough or wanted >= finest:
-            break
-        wanted *= 1.2
-    used = waves[:, numbers < math.pi * (math.floor(found[-1] / math.pi) + 1)]
-    triangle = np.linalg.qr(used / np.linalg.norm(used, axis=0), mode="r")
-    singular = np.linalg.svd(triangle, compute_uv=False)
-    cycles = found / (math.pi * 2 * radius_m) * diameter_m
-    tilt_cycles = 0.5  # an aperture-wide ramp is half a period
-    cycles[1:3] = tilt_cycles
-    return columns[:, 1:], cycles[1:], float(singular[0] / max(singular[-1], np.finfo(float).tiny))
+def _independent(pool: Pool, covariance: Float[np.ndarray, "mode mode"]) -> tuple[Pool, Float[np.ndarray, " mode"]]:
+    """Rotate functions so that turbulence excites them independently, the strongest first; and their variances."""
+    variance = np.empty(len(pool.rows))
+    rows, kinds = np.empty_like(pool.rows), np.empty_like(pool.kinds)
+    filled = 0
+    for kind in np.unique(pool.kinds):
+        members = np.flatnonzero(pool.kinds == kind)
+        made = slice(filled, filled + len(members))
+        variance[made], rotation = np.linalg.eigh(covariance[np.ix_(members, members)])
+        strongest = np.take_along_axis(rotation, np.argmax(np.abs(rotation), axis=0)[None, :], axis=0)
+        rows[made], kinds[made] = (rotation * np.sign(strongest)).T @ pool.rows[members], kind
+        filled += len(members)
+    order = np.argsort(-variance)
+    return pool._replace(rows=rows[order], kinds=kinds[order]), variance[order]
 
 
-def _kolmogorov_covariance(
-    columns: np.ndarray, lit: np.ndarray, root: np.ndarray, pixel: float
-) -> Float[np.ndarray, "mode mode"]:
+def _kolmogorov_covariance(pool: Pool, pixel: float) -> Float[np.ndarray, "mode mode"]:
     """Covariance of the coefficients for D / r0 = 1; `pixel` is in units of D.
 
-    For modes without piston it is -1/2 sum w m(r) D(r - r') w' m'(r'), a convolution on a doubled grid.
+    For modes without piston it is -1/2 sum w m(r) D(r - r') w' m'(r'), a convolution on a doubled grid. Modes of
+    different kinds go through it together.
     """
-    ny, nx = lit.shape
-    kernel = _covariance_kernel(lit.shape, pixel)
-    smeared = np.empty_like(columns)
-    for first in range(0, columns.shape[1], 32):  # a few at a time: memory
-        part = slice(first, first + 32)
-        images = np.zeros((columns[:, part].shape[1], ny, nx))
-        images[:, lit] = (columns[:, part] * root[:, None]).T
-        spectra = np.fft.rfft2(images, s=(2 * ny, 2 * nx)) * kernel
-        smeared[:, part] = np.fft.irfft2(spectra, s=(2 * ny, 2 * nx))[:, :ny, :nx][:, lit].T
-    covariance = columns.T @ (smeared * root[:, None])
+    quarter, rows = pool.quarter, pool.rows
+    ny, nx = quarter.lit.shape
+    kernel = _covariance_kernel(quarter.lit.shape, pixel)
+    groups = {kind: np.flatnonzero(pool.kinds == kind) for kind in np.unique(pool.kinds).tolist()}
+    light = pool.root / quarter.times
+    smeared = np.empty_like(rows)
+    for first in range(0, max(len(group) for group in groups.values()), FEW):
+        parts = {kind: group[first : first + FEW] for kind, group in groups.items()}
+        images = np.zeros((FEW, ny, nx))
+        for kind, part in parts.items():
+            images[: len(part)] += quarter.images(rows[part] * light, kind)
+        # Along x, then along y: half of the rows of the doubled grid are empty, or thrown away.
+        spectra = np.fft.fft(np.fft.rfft(images, 2 * nx, axis=2), 2 * ny, axis=1) * kernel
+        images = np.fft.irfft(np.fft.ifft(spectra, axis=1)[:, :ny], 2 * nx, axis=2)[:, :, :nx]
+        for kind, part in parts.items():
+            smeared[part] = quarter.part(images[: len(part)], kind)
+    covariance = rows @ (smeared * pool.root).T
     return (covariance + covariance.T) / 2
 
 
@@ -229,12 +223,12 @@ def _covariance_kernel(shape: tuple[int, ...], pixel: float) -> np.ndarray:
     return np.fft.rfft2(-KOLMOGOROV_STRUCTURE / 2 * np.hypot(y, x) ** (5 / 3))
 
 
-def _cycles_of_variance(variance: np.ndarray, root: np.ndarray, pixel: float) -> np.ndarray:
+def _cycles_of_variance(variance: np.ndarray, weights: np.ndarray, pixel: float) -> np.ndarray:
     """The frequency at which Kolmogorov turbulence gives a mode this much variance.
 
     A mode of frequency f has variance PSD(f) / area, plus what pixels fold onto it from `f + n / pixel`.
     """
-    area = pixel**2 / np.sum(root**4)
+    area = pixel**2 / np.sum(weights**2)
     cycles = np.geomspace(0.1, 0.5 / pixel, 400)
     angle_rad = (np.arange(16) + 0.5) * np.pi / 32
     fold = np.arange(-4, 5) / pixel

@@ -102,7 +102,11 @@ def _write(running: Loop, out: Path, state: LoopState, records: list[Record], ma
 def account(numbers: dict) -> list[str]:
     """What a run says at its end."""
     bounds, groups = numbers["bounds"], numbers["rms_by_group_nm"]
-    lines = [f"{numbers['frames']} frames at {numbers['rate_hz']:g} Hz: {numbers['outcome']}."]
+    star = "" if numbers["magnitude"] is None else f"Star of magnitude {numbers['magnitude']:g}: "
+    lines = [
+        f"{numbers['frames']} frames at {numbers['rate_hz']:g} Hz: {numbers['outcome']}.",
+        f"{star}{numbers['photons_per_s']:.3g} photons a second, {numbers['photons_per_frame']:.3g} a frame.",
+    ]
     if numbers["rms_nm"] is not None:
         told = ", ".join(f"{name.replace('_', '-')} {value:.0f}" for name, value in groups.items())
         lines.append(f"Residual {numbers['rms_nm']:.1f} nm rms ({told}); closed at frame {numbers['frames_to_close']}.")

@@ -17,6 +17,7 @@ from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.interop.simulated_frames import Shot, frames_of, pupil_of
 from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, frame_key, turbulence, wavelength_m
 from nlcwfs.simulation.sequence import SequenceSimulator, wind_layers
+from nlcwfs.simulation.starlight import starlight_per_s, with_exposures_of
 
 LOSS_WORTH_A_WORD = 0.01
 """Light that leaves the light's own grid comes back in on the other side; below 1 % it drowns in photon noise."""
@@ -28,6 +29,11 @@ speckles of Table 1 at 100 Hz (0.65 um) change by 0.2 % with 0.11 r0, by 0.7 % w
 EXCESS_NOISE = (
     "The multiplication of electrons doubles the variance of photon noise, which no keyword of the file says: "
     "errors will be predicted about 1.4 times too small.",
+)
+
+NO_LENGTH = (
+    "A single exposure has no length: atmosphere.photons rules, and atmosphere.star and photons_per_s are for a "
+    "sequence or a loop."
 )
 
 
@@ -50,6 +56,10 @@ def simulate(config: Config, options: SimulateOptions) -> None:
     """
     check_writable(options.out)
     dtype_name = use_precision(config.precision)
+    stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
+    starlit = starlight_per_s(config) is not None
+    if options.sequence and config.simulation.rate_hz is not None:
+        config = with_exposures_of(config, config.simulation.rate_hz)
     light = sensed_light(config)
     warnings = sampling_warnings(config, light) if options.warnings else []
     if options.sequence:
@@ -58,10 +68,10 @@ def simulate(config: Config, options: SimulateOptions) -> None:
         shots = expose_sequence(config, sequence, quiet=options.quiet)
         warnings += motion_warnings(config, sequence) if options.warnings else []
     else:
+        warnings += [NO_LENGTH] if starlit and options.warnings else []
         sequence, simulator, rate_hz = None, ExposureSimulator.build(config, pupil_of(config)), None
         shots = expose_all(config, simulator, quiet=options.quiet)
     frames = frames_of(config, simulator, shots, rate_hz=rate_hz)
-    stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
     write_frames(options.out, frames, stamp, unit="adu" if options.adu else "electron")
     for warning in [*warnings, *EXCESS_NOISE[: config.detector.em_gain > 1]]:
         warn(warning)

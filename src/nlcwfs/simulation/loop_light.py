@@ -13,6 +13,7 @@ from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
+from nlcwfs.simulation.starlight import with_exposures_of
 
 SHOWN_CYCLES = 40.0
 """Half width of the star's image in lambda / D."""
@@ -131,11 +132,11 @@ def sequence_config(config: Config) -> Config:
         >>> config.atmosphere.photons, config.simulation.frames
         (10000.0, 300)
     """
+    config = with_exposures_of(config, config.loop.rate_hz)
     loop, sky = config.loop, config.atmosphere
-    photons = sky.photons if sky.photons_per_s is None else sky.photons_per_s / loop.rate_hz
     carried_m = max(sky.wind_speeds_m_per_s) * loop.seconds
     width_m = max(SCREEN_DIAMETERS * config.beam.diameter_m, carried_m + 4 * config.beam.diameter_m)
-    air = {"photons": photons, "screen_width_m": sky.screen_width_m or width_m}
+    air = {"screen_width_m": sky.screen_width_m or width_m}
     time = {"rate_hz": loop.rate_hz, "frames": loop.frames, "substeps": loop.substeps}
     return config.model_copy(
         update={

@@ -128,6 +128,8 @@ def summary(loop: Loop, state: LoopState, records: Sequence[Record], seconds: fl
         "strehl": round(float(state.image.strehl), 4) if int(state.image.exposures) else None,
         "science_wavelength_um": settings.science_wavelength_um,
         "rate_hz": settings.rate_hz,
+        "magnitude": loop.config.atmosphere.star.magnitude,
+        "photons_per_s": float(f"{loop.light.still.photons * settings.rate_hz:.6g}"),
         "photons_per_frame": loop.light.still.photons,
         "frames": len(records),
         "frames_counted": len(counted),

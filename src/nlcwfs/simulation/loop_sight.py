@@ -3,12 +3,15 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from nlcwfs.config import Config
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.mirror.mirror import Mirror
+from nlcwfs.simulation.exposure import ExposureSimulator
 from nlcwfs.simulation.loop_light import LoopLight
 
 WORTH_FITTING = 0.02
@@ -45,9 +48,8 @@ class PixelModes(eqx.Module):
         weights = np.nan_to_num(np.asarray(still.pixel_weights(), float))
         lit = weights > 0
         root = np.sqrt(weights[lit])
-        on_pixels = eqx.filter_jit(lambda shape: still.on_pixels(still.on_light(shape)))
-        shapes = np.stack([np.asarray(on_pixels(mirror.opd_m(row)))[lit] for row in _unit_commands(mirror.count)])
-        tall = (np.nan_to_num(shapes) / UNIT_M * root).T
+        shapes = np.asarray(_on_pixels(still, mirror), float)[:, lit]
+        tall = (np.nan_to_num(shapes) * root).T
         left, size, right = np.linalg.svd(tall - root[:, None] * (root @ tall)[None], full_matrices=False)
         kept = size > WORTH_FITTING * size[0]
         fit = np.zeros((mirror.count, *weights.shape))
@@ -59,12 +61,15 @@ class PixelModes(eqx.Module):
         return jnp.tensordot(self.fit, jnp.nan_to_num(opd_m).astype(self.fit.dtype), axes=2)
 
 
-UNIT_M = 1e-9
-"""Size of the commands by which the mirror's shapes are seen: far from any stroke."""
+@eqx.filter_jit
+def _on_pixels(still: ExposureSimulator, mirror: Mirror) -> Float[Array, "mode y x"]:
+    """The mirror's shapes as the detector's pixels see them, a few at a time."""
 
+    def seen(values: Float[Array, " lit"]) -> Float[Array, "y x"]:
+        shape = jnp.zeros(mirror.shape, values.dtype).at[mirror.rows, mirror.columns].set(values)
+        return still.on_pixels(still.on_light(shape))
 
-def _unit_commands(count: int) -> Float[np.ndarray, "mode mode"]:
-    return UNIT_M * np.eye(count)
+    return jax.lax.map(seen, mirror.shapes, batch_size=8)
 
 
 class Cautious(eqx.Module):
