@@ -11,7 +11,6 @@ import argparse
 import time
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import numpy as np
 from astropy.table import Table
@@ -19,9 +18,8 @@ from astropy.table import Table
 from nlcwfs.config import load_config
 from nlcwfs.interop import Provenance
 from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_light import sequence_config
 from nlcwfs.simulation.loop_run import LoopTelemetry, run_loop, summary
-from nlcwfs.simulation.sequence import SequenceSimulator
+from nlcwfs.simulation.loop_seed import reseeded
 
 PAPER = [
     "atmosphere.seeing_arcsec=0.6",
@@ -36,11 +34,9 @@ PAPER = [
 BELOW_NM = 120.0
 
 
-def one(loop: Loop, config) -> dict:
-    """A run of one seed, with the mirror and the reconstructor of another."""
-    air = SequenceSimulator.build(sequence_config(config))
-    loop.config = config
-    loop.light = eqx.tree_at(lambda light: light.sequence, loop.light, air)
+def one(loop: Loop) -> dict:
+    """A run of one seed."""
+    config = loop.config
     begun = time.perf_counter()
     state, records = run_loop(loop)
     found = summary(loop, state, records, time.perf_counter() - begun)
@@ -78,8 +74,8 @@ def main() -> None:
     for seed in range(given.first, given.first + given.seeds):
         told = [*PAPER, f"seed={seed}", f"loop.seconds={given.seconds}", f"loop.rate_hz={given.rate}"]
         config = load_config(None, [*told, *given.overrides])
-        loop = loop or Loop.build(config)
-        rows.append({"label": given.label} | one(loop, config))
+        loop = Loop.build(config) if loop is None else reseeded(loop, seed)
+        rows.append({"label": given.label} | one(loop))
         print(rows[-1], flush=True)
         table = Table(rows=rows)
         stamp = Provenance.collect(config.model_dump(mode="json"), seed=seed, device=jax.devices()[0].device_kind)

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from nlcwfs.commands.console import INTERRUPTED, mendable
+from nlcwfs.errors import SettingsError
 
 app = typer.Typer(
     name="nlcwfs",
@@ -179,6 +180,38 @@ def study(
     from nlcwfs.commands.study import study as run
 
     run(folder, only=tuple(only or ()), screens=screens, quiet=quiet)
+
+
+@app.command()
+@mendable
+def sweep(
+    study: Annotated[
+        Path, typer.Argument(metavar="STUDY", help="Folder with sweep.toml, or such a file: grids of settings.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder of table and page; default: that of the sweep.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Processes of this machine; default: its cores.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of a dask scheduler compute.")
+    ] = None,
+    wait: Annotated[
+        float, typer.Option(min=0, metavar="SECONDS", help="Patience for the first worker of a scheduler.")
+    ] = 600.0,
+    quiet: QuietOption = False,
+) -> None:
+    """Run the loop at every point of a grid of settings, on many workers; one table, one page.
+
+    Each point is in results.ecsv as soon as it is done, and is not run again. Ends with 1 when points failed.
+    """
+    from nlcwfs.commands.sweep import SweepOptions
+    from nlcwfs.commands.sweep import sweep as run
+
+    if scheduler is not None and workers is not None:
+        raise SettingsError("--workers", "must be left out with --scheduler, which has its own", workers)
+    raise typer.Exit(run(study, SweepOptions(out, workers, scheduler, wait, quiet)))
 
 
 def main() -> None:

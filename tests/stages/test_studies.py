@@ -21,7 +21,7 @@ from nlcwfs.studies import case_run, study_run
 from nlcwfs.studies.accelerator_figures import draw_convergence, draw_light_and_turbulence, family
 from nlcwfs.studies.case_bound import LightInformation
 from nlcwfs.studies.study_cases import Capture, Case, read_study
-from nlcwfs.studies.study_figures import draw_figures
+from nlcwfs.studies.study_figures import FIGURES, draw_figures
 from nlcwfs.studies.study_light import Light, Screen
 from nlcwfs.studies.study_report import write_report
 from nlcwfs.studies.study_run import BOUND_COLUMNS, run_study
@@ -625,14 +625,18 @@ def test_the_points_against_photons_and_rms_carry_their_bars_and_bounds():
     }
 
 
+def drawn(folder, study, rows):
+    return draw_figures(folder, study.figures, rows, FIGURES)
+
+
 def test_figures_are_drawn_when_their_rows_are_there(tmp_path):
     study = read_study(written(tmp_path, 'figures = ["convergence", "photons-and-turbulence"]\n' + SHORT))
-    assert draw_figures(tmp_path, study, table_of(tmp_path, [row("a", "few")])) == {}
-    captions = draw_figures(tmp_path, study, table_of(tmp_path, convergence_rows()))
+    assert drawn(tmp_path, study, [row("a", "few")]) == {}
+    captions = drawn(tmp_path, study, convergence_rows())
     assert list(captions) == ["convergence.png"]
     assert (tmp_path / "convergence.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.png", "study.toml"]
-    assert draw_figures(tmp_path, read_study(written(tmp_path)), table_of(tmp_path, convergence_rows())) == {}
+    assert drawn(tmp_path, read_study(written(tmp_path)), convergence_rows()) == {}
 
 
 # ----------------------------------------------------------------------------------------------- the command

@@ -32,7 +32,7 @@ def study(folder: Path, *, only: tuple[str, ...], screens: int | None, quiet: bo
                 say(f"{case}: {total} screens", quiet=quiet)
 
         table = run_study(folder, progress=progress, only=only, screens=screens)
-    from nlcwfs.studies.study_figures import draw_figures
+    from nlcwfs.studies.study_figures import FIGURES, draw_figures
     from nlcwfs.studies.study_report import quick_lines, write_report
 
     if screens is not None:
@@ -40,7 +40,7 @@ def study(folder: Path, *, only: tuple[str, ...], screens: int | None, quiet: bo
         say("\n".join([*lines, f"{len(lines)} cases in {table.path}; {screens} screens tell little."]), quiet=quiet)
         return
     chosen = read_study(folder)
-    pictures = draw_figures(folder, chosen, table)
+    pictures = draw_figures(folder, chosen.figures, table.rows, FIGURES)
     path = write_report(folder, chosen, table, pictures)
     say(
         f"{len(table.rows)} cases in {table.path}; wrote {path} and {', '.join(pictures) or 'no picture'}.", quiet=quiet

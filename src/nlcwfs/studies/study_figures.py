@@ -1,6 +1,6 @@
 """The figures that a study asks for, drawn from its table."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -8,10 +8,12 @@ from matplotlib.figure import Figure
 from nlcwfs.interop import atomic_write
 from nlcwfs.studies.accelerator_figures import draw_convergence, draw_light_and_turbulence
 from nlcwfs.studies.method_figures import draw_calibration, draw_cost
-from nlcwfs.studies.study_cases import Study
-from nlcwfs.studies.study_table import Row, StudyTable
+from nlcwfs.studies.study_table import Row
 
-FIGURES: dict[str, tuple[Callable[[list[Row]], Figure | None], str]] = {
+Drawings = dict[str, tuple[Callable[[list[Row]], Figure | None], str]]
+"""What draws a figure, None where its rows are missing, and its caption, by its name."""
+
+FIGURES: Drawings = {
     "convergence": (
         draw_convergence,
         "Captured screens and median error against the FFTs of one plane: D/r0 = 8.2, 2e4 photons, 45 pixels, "
@@ -34,19 +36,25 @@ FIGURES: dict[str, tuple[Callable[[list[Row]], Figure | None], str]] = {
         "the most likely wavefront, whole and by the spatial frequency of the modes. Right: every method, whole.",
     ),
 }
-"""What draws a figure, None where its rows are missing, and its caption."""
+"""The figures of `nlcwfs study`."""
 
 
-def draw_figures(folder: Path, study: Study, table: StudyTable) -> dict[str, str]:
-    """Draw every figure of a study whose rows are there.
+def draw_figures(folder: Path, names: Iterable[str], rows: list[Row], drawings: Drawings) -> dict[str, str]:
+    """Draw the figures whose rows are there.
+
+    Args:
+        folder: Where the pictures go.
+        names: The figures that a study asks for.
+        rows: Of its table.
+        drawings: What there is to draw, `FIGURES` or that of sweeps.
 
     Returns:
         The caption of each picture, by file name.
     """
     captions = {}
-    for name in study.figures:
-        draw, caption = FIGURES[name]
-        figure = draw(table.rows)
+    for name in names:
+        draw, caption = drawings[name]
+        figure = draw(rows)
         if figure is None:
             continue
         with atomic_write(folder / f"{name}.png") as temporary:

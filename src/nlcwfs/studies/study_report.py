@@ -71,7 +71,7 @@ def write_report(folder: Path, study: Study, table: StudyTable, pictures: dict[s
     for group, heading in study.groups.items():
         rows = [row for row in table.rows if row["group"] == group]
         if rows:
-            lines += [f"## {heading}", "", *_table(rows, COLUMNS[study.score]), ""]
+            lines += [f"## {heading}", "", *markdown_table(rows, COLUMNS[study.score]), ""]
     lines += [study.notes.strip(), ""]
     path = folder / "README.md"
     with atomic_write(path) as temporary:
@@ -91,7 +91,7 @@ def quick_lines(study: Study, table: StudyTable, only: tuple[str, ...]) -> list[
     ]
 
 
-def _table(rows: list[Row], columns: dict[str, Column]) -> list[str]:
+def markdown_table(rows: list[Row], columns: dict[str, Column]) -> list[str]:
     """Markdown; a column without a number in any row is left out."""
     cells = {title: [_cell(row, keys, form) for row in rows] for title, (keys, form) in columns.items()}
     kept = {title: column for title, column in cells.items() if any(column)}

@@ -1,4 +1,4 @@
-"""The table of a study: one row a case, stamped, kept on disk after each, so that a study resumes."""
+"""The table of a study: one row a case or a point, stamped, kept on disk after each, so that a study resumes."""
 
 import io
 import math
@@ -12,8 +12,11 @@ from nlcwfs.interop import Provenance, atomic_write
 
 Row = dict[str, str | int | float]
 
-LAST = ("commit", "digest")
+LAST = ("device", "error", "commit", "digest")
 """Columns at the end of the table, whatever columns join later."""
+
+NEEDED = {"case": ("case", "group", "digest"), "point": ("point", "case", "digest")}
+"""Columns without which a file is no table of a study, by what a row is about."""
 
 
 class StudyTable:
@@ -21,31 +24,39 @@ class StudyTable:
 
     Attributes:
         path: The ECSV file.
+        key: Column of the names: `case`, or what else a row is about.
         rows: What it holds; a row that is older than a column has NaN there, or no text.
 
     Raises:
         FileFormatError: If the file is there and is no such table.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, key: str = "case") -> None:
+        self.path, self.key = path, key
         self.rows: list[Row] = []
         if path.is_file():
-            self.rows = _read(path)
+            self.rows = _read(path, NEEDED[key])
 
     def holds(self, name: str, digest: str) -> bool:
         """Whether the table has this case with these settings."""
-        return any(row["case"] == name and row["digest"] == digest for row in self.rows)
+        return any(row[self.key] == name and row["digest"] == digest for row in self.rows)
 
     def put(self, row: Row, provenance: Provenance) -> None:
-        """Add a row, or replace that of the same case, and write the table."""
-        self.rows = [*(kept for kept in self.rows if kept["case"] != row["case"]), row]
+        """Add a row, or replace that of the same name, and write the table."""
+        self.rows = [*(kept for kept in self.rows if kept[self.key] != row[self.key]), row]
         self._write(provenance)
 
-    def sort(self, names: list[str], provenance: Provenance) -> None:
-        """Bring the rows into the order of the study; rows of cases that no longer exist go."""
+    def sort(self, names: list[str], provenance: Provenance, *, others: bool = False) -> None:
+        """Bring the rows into the order of the study.
+
+        Args:
+            names: All that the study asks for.
+            provenance: Stamp of a table that changes.
+            others: Whether rows that it no longer asks for stay, at the end.
+        """
         order = {name: number for number, name in enumerate(names)}
-        rows = sorted((row for row in self.rows if row["case"] in order), key=lambda row: order[str(row["case"])])
+        kept = [row for row in self.rows if others or row[self.key] in order]
+        rows = sorted(kept, key=lambda row: order.get(str(row[self.key]), len(order)))
         if rows != self.rows:  # a table that was left as it is keeps the stamp of who made it
             self.rows = rows
             self._write(provenance)
@@ -62,22 +73,24 @@ class StudyTable:
             temporary.write_text(text.getvalue(), encoding="utf-8")
 
 
-def _read(path: Path) -> list[Row]:
+def _read(path: Path, needed: tuple[str, ...]) -> list[Row]:
     try:
         table = Table.read(path.read_text(encoding="utf-8").splitlines(), format="ascii.ecsv")
     except Exception as error:  # astropy and its YAML have a dozen kinds
         reason = " ".join(str(error).split())[:200]
         raise FileFormatError(f"{path}: must be the table of a study (delete it to start anew), got {reason}") from None
     names = list(table.colnames)
-    missing = [name for name in ("case", "group", "digest") if name not in names]
+    missing = [name for name in needed if name not in names]
     if missing:
-        rule = f"must have the columns case, group and digest (delete it to start anew), got no {missing[0]}"
+        listed = f"{', '.join(needed[:-1])} and {needed[-1]}"
+        rule = f"must have the columns {listed} (delete it to start anew), got no {missing[0]}"
         raise FileFormatError(f"{path}: {rule}")
-    columns = [_filled(table[name].tolist()) for name in names]  # numbers of Python; ECSV reads no text as None
+    texts = [table[name].dtype.kind == "U" for name in names]  # ECSV reads no text as None, even in a whole column
+    columns = [_filled(table[name].tolist(), text=text) for name, text in zip(names, texts, strict=True)]
     return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
-def _filled(values: list[str | int | float | None]) -> list[str | int | float]:
+def _filled(values: list[str | int | float | None], *, text: bool = False) -> list[str | int | float]:
     """Something for rows that are older than the column."""
-    nothing = "" if any(isinstance(value, str) for value in values) else math.nan
+    nothing = "" if text or any(isinstance(value, str) for value in values) else math.nan
     return [nothing if value is None else value for value in values]

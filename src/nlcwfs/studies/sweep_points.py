@@ -1,0 +1,234 @@
+"""The question of a sweep and its points, runs of the loop over a grid of settings, as written in its `sweep.toml`."""
+
+import hashlib
+import itertools
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from nlcwfs.config import Config, load_config
+from nlcwfs.config_messages import problems_in_words
+from nlcwfs.config_text import toml_value
+from nlcwfs.errors import FileFormatError, SettingsError
+
+SEED = "seed"
+"""The setting over which statistics are taken; the innermost of every grid, so that a mirror serves many seeds."""
+
+Grid = dict[str, tuple[Any, ...]]
+"""Values of each setting."""
+
+
+class Point(NamedTuple):
+    """One run of the loop.
+
+    Attributes:
+        name: Unique within the sweep; also that of its folder.
+        case: Family that it belongs to.
+        config: Its settings.
+        columns: Those of its settings that the table tells.
+        keep: Whether its folder is kept.
+        digest: Fingerprint of what it differs by from the defaults.
+    """
+
+    name: str
+    case: str
+    config: Config
+    columns: dict[str, str | int | float]
+    keep: bool
+    digest: str
+
+
+class SweepCase(BaseModel):
+    """A family of points.
+
+    Attributes:
+        name: Unique within the sweep.
+        set: Settings, as on the command line; stronger than those of the sweep.
+        grid: Lists of values, beside those of the sweep or instead of them.
+        keep: Whether whole runs are kept; as the sweep says when left out.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=r"^\w[\w.+-]*$")
+    set: tuple[str, ...] = ()
+    grid: Grid = {}
+    keep: bool | None = None
+
+    @field_validator("grid", mode="before")
+    @classmethod
+    def _flat(cls, written: Any) -> Any:
+        return flat_grid(written)
+
+
+class Sweep(BaseModel):
+    """A question, what all its points share, and its cases.
+
+    Attributes:
+        question: What is asked.
+        answer: The first line of its page, written when the table is there.
+        notes: The end of its page.
+        figures: What to draw of the table, see `sweep_figures`.
+        config: File of settings, seen from the sweep's folder.
+        set: Settings that all points share; stronger than the file.
+        grid: Lists of values: every combination is a point.
+        keep: Whether whole runs are kept, with telemetry and image.
+        case: The cases; one without a name when left out.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    question: str
+    answer: str = "Not answered yet"
+    notes: str = ""
+    figures: tuple[str, ...] = ()
+    config: str | None = None
+    set: tuple[str, ...] = ()
+    grid: Grid = {}
+    keep: bool = False
+    case: tuple[SweepCase, ...] = Field(default=(SweepCase(name="all"),), min_length=1)
+
+    @field_validator("grid", mode="before")
+    @classmethod
+    def _flat(cls, written: Any) -> Any:
+        return flat_grid(written)
+
+    def keys(self) -> list[str]:
+        """Settings that any grid varies, the seed last."""
+        named = dict.fromkeys([*self.grid, *(key for case in self.case for key in case.grid)])
+        return [*(key for key in named if key != SEED), SEED]
+
+    def grid_of(self, case: SweepCase) -> Grid:
+        """The grid of a case, the seed last."""
+        grid = self.grid | case.grid
+        return {key: grid[key] for key in sorted(grid, key=lambda key: key == SEED)}
+
+
+def flat_grid(written: Any) -> Any:
+    """A grid with the whole path of every key, however TOML was written.
+
+    Examples:
+        >>> flat_grid({"loop": {"rate_hz": [100, 200]}, "beam.diameter_m": [8]})
+        {'loop.rate_hz': [100, 200], 'beam.diameter_m': [8]}
+    """
+    if not isinstance(written, dict):
+        return written
+    flat = {}
+    for key, values in written.items():
+        if isinstance(values, dict):
+            flat |= {f"{key}.{below}": each for below, each in flat_grid(values).items()}
+            continue
+        if not isinstance(values, list | tuple) or not values:
+            raise ValueError(f"{key} must be a list of values, got {toml_value(values)}")
+        flat[key] = values
+    return flat
+
+
+def read_sweep(path: Path) -> tuple[Sweep, tuple[Point, ...]]:
+    """The sweep of a file, or of a folder with `sweep.toml`, and its points, each with settings that can be.
+
+    Raises:
+        FileFormatError: If the file is missing or wrong, or a setting in it is impossible; names file and case.
+    """
+    path = sweep_file(path)
+    if not path.is_file():
+        raise FileFormatError(f"{path}: must exist, got no such file")
+    try:
+        sweep = Sweep.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path}: must be TOML, got {error}") from None
+    except ValidationError as error:
+        raise FileFormatError(f"{path}: {problems_in_words(Sweep, error)[0]}") from None
+    points = tuple(_points(path, sweep))
+    names = [point.name for point in points]
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    if twice:
+        raise FileFormatError(f"{path}: points must differ in the letters and digits of their settings, got {twice[0]}")
+    return sweep, points
+
+
+def sweep_file(path: Path) -> Path:
+    """The file of a sweep, of which the user may name the folder.
+
+    Examples:
+        >>> sweep_file(Path("rates.toml")).name
+        'rates.toml'
+    """
+    return path / "sweep.toml" if path.is_dir() else path
+
+
+def _points(path: Path, sweep: Sweep) -> Iterator[Point]:
+    names = [case.name for case in sweep.case]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise FileFormatError(f"{path}: case.name: must be unique, got twice {twice}")
+    file, keys = (None if sweep.config is None else path.parent / sweep.config), sweep.keys()
+    for case in sweep.case:
+        grid, keep = sweep.grid_of(case), sweep.keep if case.keep is None else case.keep
+        for values in itertools.product(*grid.values()):
+            chosen = dict(zip(grid, values, strict=True))
+            try:
+                config = load_config(file, [*sweep.set, *case.set, *_assignments(chosen)])
+                if config.beam.pupil_map is not None:
+                    raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
+            except SettingsError as error:
+                where = "set" if str(error) == _shared_problem(file, sweep) else f"case {case.name}"
+                raise FileFormatError(f"{path}: {where}: {'; '.join(str(error).splitlines())}") from None
+            name = ",".join([case.name, *(f"{key}={_in_name(value)}" for key, value in chosen.items())])
+            columns = {key: told for key in keys if (told := _told(config, key, chosen)) is not None}
+            yield Point(name, case.name, config, columns, keep, point_digest(config, keep=keep))
+
+
+def point_digest(config: Config, *, keep: bool) -> str:
+    """What a row is the answer to: every setting that is not the default, and whether the run was to be kept.
+
+    A setting or a section that is new and left at its default makes no stored row stale.
+
+    Examples:
+        >>> point_digest(Config(), keep=False) == point_digest(Config(seed=0), keep=False)
+        True
+    """
+    told = _flattened(config.model_dump(mode="json", exclude_defaults=True)) | ({"keep": True} if keep else {})
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _assignments(chosen: dict[str, Any]) -> list[str]:
+    return [f"{key}={toml_value(value)}" for key, value in chosen.items()]
+
+
+def _shared_problem(file: Path | None, sweep: Sweep) -> str:
+    """What is wrong with the settings that all points share."""
+    try:
+        load_config(file, sweep.set)
+    except SettingsError as error:
+        return str(error)
+    return ""
+
+
+def _in_name(value: Any) -> str:
+    """A value in the name of a point, which is also that of a folder."""
+    return re.sub(r"[^\w.+-]+", "_", str(value) if isinstance(value, str) else toml_value(value))[:60]
+
+
+def _told(config: Config, key: str, chosen: dict[str, Any]) -> str | int | float | None:
+    """A setting as the table tells it: also of points whose own grid does not name it."""
+    value: Any = config.model_dump(mode="json")
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    if value is None:
+        value = chosen.get(key)
+    return value if value is None or (isinstance(value, str | int | float) and value is not True) else toml_value(value)
+
+
+def _flattened(content: dict[str, Any]) -> dict[str, Any]:
+    """Nested tables as one, without the empty ones."""
+    flat = {}
+    for key, value in content.items():
+        flat |= {f"{key}.{below}": each for below, each in _flattened(value).items()} if isinstance(value, dict) else {}
+        flat |= {} if isinstance(value, dict) else {key: value}
+    return flat
