@@ -1,10 +1,12 @@
 """What a user may choose about a Shack-Hartmann sensor."""
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class ShackHartmannSettings(BaseModel):
-    """The lenslets, and the pixels behind each.
+    """The lenslets, the pixels behind each, and what a loop makes of them.
 
     Examples:
         >>> ShackHartmannSettings().subapertures
@@ -14,17 +16,53 @@ class ShackHartmannSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     subapertures: int = Field(
-        default=18, ge=2, le=128, description="subapertures across the diameter of the telescope, D/d"
+        default=18, ge=2, le=128, description="Subapertures across the diameter of the telescope, D/d."
     )
-    pixels: int = Field(default=64, ge=2, le=256, description="detector pixels along a side of a subaperture's image")
+    pixels: int = Field(default=64, ge=2, le=256, description="Detector pixels along a side of a subaperture's image.")
     field_lambda_over_d: float = Field(
         default=8.0,
         ge=2,
         le=64,
-        description="width of a subaperture's field of view in units of wavelength / d; light beyond it is stopped",
+        description="Width of a subaperture's field of view in units of wavelength / d; light beyond it is stopped.",
     )
     least_light: float = Field(
-        default=0.7, gt=0, le=1, description="a subaperture serves if it gets this share of the light of a full one"
+        default=0.7, gt=0, le=1, description="A subaperture serves if it gets this share of the light of a full one."
+    )
+    centroid: Literal["matched", "gravity", "thresholded", "weighted"] = Field(
+        default="matched",
+        description="How a spot's place is found: matched filter on the running mean spot, centre of gravity of all "
+        "light in the window, the same after a threshold, or under a Gaussian weight.",
+    )
+    window_lambda_over_d: float | None = Field(
+        default=None,
+        gt=0.5,
+        le=64,
+        examples=[4.0],
+        description="Width of the window in which light is looked at, in units of wavelength / d; leave out for the "
+        "whole field.",
+    )
+    threshold: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description="Share of a spot's brightest pixel that is taken off all of them, when thresholded.",
+    )
+    weight_lambda_over_d: float = Field(
+        default=2.0,
+        gt=0,
+        le=64,
+        description="Full width at half maximum of the Gaussian weight, in units of wavelength / d, when weighted.",
+    )
+    cutoff_cpa: float | None = Field(
+        default=None,
+        gt=0.5,
+        le=500,
+        examples=[12.0],
+        description="Highest frequency that the mirror is driven at, cycles per aperture; leave out for half the "
+        "subapertures across, all that they see.",
+    )
+    memory: float = Field(
+        default=0.9, ge=0, lt=1, description="Weight of what was known in each update of the running mean spot."
     )
 
     @model_validator(mode="after")

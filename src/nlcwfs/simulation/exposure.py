@@ -34,12 +34,14 @@ class Exposure(eqx.Module):
             moves, its mean over the exposure.
         photons: Mean photons on every detector pixel, without background.
         frames: What the detector read.
-        truth_m: Mean of `opd_m` over the light of every detector pixel; NaN where there is none.
+        truth_m: Mean of `opd_m` over the light of every detector pixel of a pupil image; NaN where there is none.
         lost: Share of the light of each plane that misses the detector's window.
+
+    A Shack-Hartmann sensor has spots in place of planes.
     """
 
     opd_m: Float[Array, "*frame Y X"]
-    photons: Float[Array, "*frame plane y x"]
+    photons: Float[Array, "*frame plane v u"]
     frames: Frames
     truth_m: Float[Array, "*frame y x"]
     lost: Float[Array, "*frame plane"]

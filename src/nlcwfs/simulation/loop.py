@@ -20,7 +20,7 @@ from nlcwfs.science.rms_groups import rms_groups
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_faults import bump_m, damaged, fault_in
 from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_measurement import Measurement, build_measurement
+from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor
 from nlcwfs.simulation.loop_sight import Sight
 
 GROUPS = ("tip_tilt", "low", "middle", "high", "beyond")
@@ -74,7 +74,7 @@ class Loop:
         basis: Modes on the detector's pixels, for the groups.
     """
 
-    def __init__(self, config: Config, *, light: LoopLight, measurement: Measurement, controller: Controller) -> None:
+    def __init__(self, config: Config, *, light: LoopLight, measurement: LoopSensor, controller: Controller) -> None:
         self.config, self.light, self.measurement, self.controller = config, light, measurement, controller
         self.basis = pixel_basis(light)
         self._groups = jax.jit(self._group_squares)
@@ -94,7 +94,7 @@ class Loop:
             raise SettingsError("loop.rate_hz", rule, f"{config.loop.rate_hz:g}")
         light = LoopLight.build(config)
         controller = Controller.build(config.feedback, light.mirror.count, config.loop.rate_hz)
-        return cls(config, light=light, measurement=build_measurement(config, light), controller=controller)
+        return cls(config, light=light, measurement=build_sensor(config, light), controller=controller)
 
     def init(self) -> LoopState:
         """Before the first exposure: the mirror flat, or with the shape of the air."""

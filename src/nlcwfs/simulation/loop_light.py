@@ -12,6 +12,8 @@ from nlcwfs.feedback.delay_line import DelayLine
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
+from nlcwfs.simulation.loop_lenslet_light import LensletOptics
+from nlcwfs.simulation.loop_optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
 
@@ -40,14 +42,16 @@ class LoopLight(eqx.Module):
     """Air that moves, a mirror that is told, and the light behind both.
 
     Attributes:
-        sequence: The air, the sensor's optics and its detector.
+        sequence: The air, the grid of the light, the photons and the detector.
         mirror: On the part of the light's grid that holds the pupil.
         weights: Share of the light there.
+        optics: The sensor's.
     """
 
     sequence: SequenceSimulator
     mirror: Mirror
     weights: Float[Array, "lit_y lit_x"]
+    optics: LoopOptics
 
     @classmethod
     def build(cls, config: Config) -> "LoopLight":
@@ -65,12 +69,20 @@ class LoopLight(eqx.Module):
         dtype = str(still.weights.dtype)
         mirror = Mirror.build(config.mirror, pupil, part, diameter_m=diameter_m, dtype=dtype)
         weights = _middle(np.asarray(still.weights, float), cut)
-        return cls(sequence=sequence, mirror=mirror, weights=jnp.asarray(weights, dtype))
+        optics = CurvatureOptics(still)
+        if config.loop.sensor == "shack-hartmann":
+            optics = LensletOptics.build(config, still, weights > 0)
+        return cls(sequence=sequence, mirror=mirror, weights=jnp.asarray(weights, dtype), optics=optics)
 
     @property
     def still(self) -> ExposureSimulator:
         """The optics."""
         return self.sequence.still
+
+    @property
+    def part(self) -> Grid:
+        """The part of the light's grid that holds the pupil."""
+        return Grid((self.weights.shape[0], self.weights.shape[1]), self.still.light.pixel_m)
 
     def star_image(self, wavelength_m: float) -> LongExposure:
         """An image to which nothing has been added yet."""
@@ -106,16 +118,17 @@ class LoopLight(eqx.Module):
             opd_m = self.sequence.flow.opd_m(moment[0]) + bump_m - moment[1] * before_m - (1 - moment[1]) * after_m
             opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
             whole_m = still.on_light(opd_m)
-            planes = still.sensor.images(whole_m, share * still.photons).photons
+            images = self.optics.images(opd_m, share * still.photons)
             square = jnp.sum(self.weights * opd_m**2)
-            return (sums[0] + whole_m * share, sums[1] + planes, sums[2] + square * share, sums[3].add(opd_m)), None
+            return (sums[0] + whole_m * share, sums[1] + images, sums[2] + square * share, sums[3].add(opd_m)), None
 
-        shape, dtype = still.sensor.transfer.shape[1:], still.weights.dtype
-        none = (jnp.zeros(shape[1:], dtype), jnp.zeros(shape, dtype), jnp.zeros((), dtype), image)
+        dark = jax.eval_shape(lambda opd_m: self.optics.images(opd_m, still.photons), self.weights)
+        dtype = self.weights.dtype
+        none = (jnp.zeros(still.light.shape, dtype), jnp.zeros(dark.shape, dtype), jnp.zeros((), dtype), image)
         early = self._share_before(line.share_before)
-        (opd_m, planes, square, image), _ = jax.lax.scan(add, none, (moments_s, early))
+        (opd_m, images, square, image), _ = jax.lax.scan(add, none, (moments_s, early))
         key = jax.random.split(jax.random.fold_in(jax.random.key(self.sequence.seed), frame))[1]
-        return Corrected(still.read(opd_m, planes, key), square, image)
+        return Corrected(self.optics.read(opd_m, images, key), square, image)
 
     def _share_before(self, share: float) -> Float[Array, " substep"]:
         """For each moment, the part of its time with the earlier command on the mirror."""

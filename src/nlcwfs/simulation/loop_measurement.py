@@ -226,20 +226,3 @@ class IdealMeasurement(eqx.Module):
         inner = tuple(slice(m, m + size) for m, size in zip(margins, mirror_m.shape, strict=True))
         residual_m = self.light.mirror.fitted(exposure.opd_m[inner])
         return Sight(residual_m, Outcome.CONVERGED, 0.0, 0, True), None
-
-
-Measurement = FollowedCurvature | SingleFrames | IdealMeasurement
-"""A sensor with its reconstructor; `measure` carries a memory of its own, None before the first exposure."""
-
-
-def build_measurement(config: Config, light: LoopLight) -> Measurement:
-    """The sensor and method that a configuration names.
-
-    Raises:
-        SettingsError: If settings contradict each other.
-    """
-    if config.loop.sensor == "ideal":
-        return IdealMeasurement(light)
-    if config.estimation.method == "map" and config.loop.follow:
-        return FollowedCurvature.build(config, light)
-    return SingleFrames.build(config, light)

@@ -25,10 +25,10 @@ class LoopSettings(BaseModel):
         le=1000,
         description="Moments of an exposure, evenly spread, whose light is summed while the air moves.",
     )
-    sensor: Literal["curvature", "ideal"] = Field(
+    sensor: Literal["curvature", "ideal", "shack-hartmann"] = Field(
         default="curvature",
-        description="What measures: the curvature sensor with the method of [estimation], or an ideal sensor that sees "
-        "the mean wavefront without noise.",
+        description="What measures: the curvature sensor with the method of [estimation], an ideal sensor that sees "
+        "the mean wavefront without noise, or the lenslets of [shack_hartmann].",
     )
     start: Literal["open", "closed"] = Field(
         default="open", description="Whether the mirror is flat at first, or already has the shape of the air."

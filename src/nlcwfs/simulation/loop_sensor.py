@@ -1,0 +1,53 @@
+"""The sensors that a loop may have, behind one interface."""
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Array, Bool, Float
+
+from nlcwfs.config import Config
+from nlcwfs.simulation.exposure import Exposure
+from nlcwfs.simulation.loop_lenslet_light import LensletOptics
+from nlcwfs.simulation.loop_lenslets import FollowedSpots
+from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.loop_measurement import FollowedCurvature, IdealMeasurement, SingleFrames
+from nlcwfs.simulation.loop_sight import Sight
+
+
+@runtime_checkable
+class LoopSensor(Protocol):
+    """What a sensor and its reconstructor make of an exposure; its light is that of `LoopOptics`."""
+
+    def measure(
+        self,
+        exposure: Exposure,
+        usable: Bool[Array, "image v u"],
+        mirror_m: Float[Array, "lit_y lit_x"],
+        memory: Any,
+    ) -> tuple[Sight, Any]:
+        """What an exposure shows of the mirror's modes.
+
+        Args:
+            exposure: What arrived, background subtracted.
+            usable: Pixels that were read; the others are zero.
+            mirror_m: Mean shape of the mirror over the exposure.
+            memory: What the last exposure left; None before the first.
+
+        Returns:
+            The residual of each mode, and what the next exposure is to know.
+        """
+        ...
+
+
+def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
+    """The sensor and method that a configuration names.
+
+    Raises:
+        SettingsError: If settings contradict each other.
+    """
+    if isinstance(light.optics, LensletOptics):
+        return FollowedSpots.build(config, light, light.optics)
+    if config.loop.sensor == "ideal":
+        return IdealMeasurement(light)
+    if config.estimation.method == "map" and config.loop.follow:
+        return FollowedCurvature.build(config, light)
+    return SingleFrames.build(config, light)
