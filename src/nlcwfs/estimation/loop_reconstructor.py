@@ -40,9 +40,7 @@ class LoopMatrix(NamedTuple):
     error_m2: Float[np.ndarray, " driven"]
 
 
-def loop_reconstructor(
-    known: LoopModes, *, noise_rad2: Float[np.ndarray, " slope"], closed: bool
-) -> LoopMatrix:
+def loop_reconstructor(known: LoopModes, *, noise_rad2: Float[np.ndarray, " slope"], closed: bool) -> LoopMatrix:
     r"""The reconstructor with the least mean square error of the driven modes.
 
     :math:`R = (G^T N^{-1} G + C^{-1})^{-1} G^T N^{-1}` as `minimum_variance`; modes that are not driven have the

@@ -41,8 +41,9 @@ def turned_regions(
 ) -> list[TurnedRegion]:
     r"""Connected regions whose move by a turn makes neighbours more alike, the largest first; the main one stays.
 
-    Of all ways to move cells by one turn, one after the other, that with the least :math:`\sum w\,(\phi_p - \phi_q)^2` over neighbours,
-    exactly, as the minimum cut of a graph (Bioucas-Dias & Valadao 2007, IEEE Trans. Image Process. 16, 698).
+    Of all ways to move cells by a turn, one after the other, that with the least :math:`\sum w\,(\phi_p - \phi_q)^2`
+    over neighbours, exactly, as the minimum cut of a graph (Bioucas-Dias & Valadao 2007, IEEE Trans. Image Process. 16,
+    698).
 
     Args:
         phase_rad: A rough phase, unwrapped as far as is known.
