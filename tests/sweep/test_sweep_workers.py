@@ -1,6 +1,7 @@
 """Workers that die, a scheduler elsewhere: every point comes, and what is missing is told in a line."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -99,6 +100,24 @@ def pretend(point):
         raise ZeroDivisionError("a\nb")
     row = {"point": point.name, "case": point.case, "outcome": "closed", "rms_nm": 1.0 + seed}
     return PointResult(row | {"error": "", "commit": "abc", "digest": point.digest}, {})
+
+
+def settings_of_jax():
+    import jax
+
+    cache = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
+    return *cache, os.environ["XLA_FLAGS"], os.environ["OMP_NUM_THREADS"]
+
+
+def test_a_worker_has_one_thread_and_keeps_compiled_code(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    with local_cluster(1) as client:
+        ((folder, least_s, flags, threads),) = client.run(settings_of_jax).values()
+    assert folder == str(tmp_path / "nlcwfs" / "compiled" / platform.node())
+    assert least_s == 0
+    assert flags == "--xla_cpu_enable_fast_math=false --xla_cpu_multi_thread_eigen=false"
+    assert threads == "1"
 
 
 def test_a_point_that_kills_its_workers_fails_alone(tmp_path, monkeypatch):
