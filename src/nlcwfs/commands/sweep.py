@@ -61,7 +61,7 @@ def sweep(study: Path, options: SweepOptions) -> int:
     if missing:
         try:
             with _cluster(options, len(missing)) as client, _told(len(missing), quiet=options.quiet) as watch:
-                say(f"Dashboard: {client.dashboard_link}", quiet=options.quiet)
+                say(f"Dashboard: {client.dashboard_link or 'none'}", quiet=options.quiet)
                 run_sweep(client, asked, missing, table, watch)
         except KeyboardInterrupt:
             left = len(missing_points(points, table))

@@ -63,9 +63,10 @@ class PointRunner:
 
     def _loop_of(self, config: Config) -> Loop:
         family = digest(config.model_copy(update={"seed": 0}))
-        if self._loop is None or family != self._family:
+        if self._loop is not None and family != self._family:
             self._loop = None
             jax.clear_caches()  # else a long sweep would fill the memory with compiled code
+        if self._loop is None:
             self._family, self._loop = family, Loop.build(config)
         return self._loop if self._loop.config.seed == config.seed else reseeded(self._loop, config.seed)
 

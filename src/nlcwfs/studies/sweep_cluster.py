@@ -8,6 +8,8 @@ from contextlib import contextmanager
 import dask.config
 from dask.system import CPU_COUNT
 from distributed import Client, LocalCluster
+from distributed.comm.addressing import resolve_address
+from distributed.utils import silence_logging_cmgr
 
 from nlcwfs.errors import NlcwfsError
 from nlcwfs.studies.sweep_worker import SweepWorker
@@ -20,6 +22,8 @@ ON_A_LONG_LEASH = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
+    # A worker that dies takes down what it computes, and no other point that waits there.
+    "distributed.scheduler.worker-saturation": 1.0,
     # Compiling takes a minute in which Python does not answer: no reason to warn.
     "distributed.admin.tick.limit": "1 h",
 }
@@ -52,15 +56,15 @@ def connected(address: str, *, wait_s: float, tell: Callable[[str], None]) -> It
     Raises:
         ClusterError: If the scheduler does not answer, no worker comes, or one cannot import what it needs.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+        resolve_address(address)  # a client would say so twenty seconds later
+        client = Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError, OverflowError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ClusterError(
             f"--scheduler: must be the address of a running scheduler, got {address}: {reason}"
         ) from None
-    with client:
+    with silence_logging_cmgr(logging.CRITICAL), client:
         try:
             client.register_plugin(SweepWorker())
         except Exception as error:  # whatever stops a worker or a scheduler from importing nlcwfs

@@ -5,11 +5,12 @@ import itertools
 import json
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from nlcwfs.config import Config, load_config
 from nlcwfs.config_messages import problems_in_words
@@ -19,8 +20,17 @@ from nlcwfs.errors import FileFormatError, SettingsError
 SEED = "seed"
 """The setting over which statistics are taken; the innermost of every grid, so that a mirror serves many seeds."""
 
-Grid = dict[str, tuple[Any, ...]]
-"""Values of each setting."""
+Grid = dict[str, list[Any]]
+"""Values of each setting, by its whole path."""
+
+NAME = re.compile(r"\w[\w.+-]*")
+"""Of a case: it becomes a part of the name of a folder."""
+
+PLAIN = str | int | float | list | dict
+"""What a value may be; TOML knows dates, too."""
+
+LONGEST_VALUE, LONGEST_NAME = 40, 180
+"""Letters of a value in the name of a point, and of that name: file systems allow 255."""
 
 
 class Point(NamedTuple):
@@ -55,15 +65,10 @@ class SweepCase(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str = Field(pattern=r"^\w[\w.+-]*$")
+    name: str
     set: tuple[str, ...] = ()
-    grid: Grid = {}
-    keep: bool | None = None
-
-    @field_validator("grid", mode="before")
-    @classmethod
-    def _flat(cls, written: Any) -> Any:
-        return flat_grid(written)
+    grid: dict[str, Any] = {}
+    keep: bool | None = Field(default=None, strict=True)
 
 
 class Sweep(BaseModel):
@@ -89,43 +94,47 @@ class Sweep(BaseModel):
     figures: tuple[str, ...] = ()
     config: str | None = None
     set: tuple[str, ...] = ()
-    grid: Grid = {}
-    keep: bool = False
+    grid: dict[str, Any] = {}
+    keep: bool = Field(default=False, strict=True)
     case: tuple[SweepCase, ...] = Field(default=(SweepCase(name="all"),), min_length=1)
 
-    @field_validator("grid", mode="before")
-    @classmethod
-    def _flat(cls, written: Any) -> Any:
-        return flat_grid(written)
-
-    def keys(self) -> list[str]:
+    def varied(self) -> list[str]:
         """Settings that any grid varies, the seed last."""
-        named = dict.fromkeys([*self.grid, *(key for case in self.case for key in case.grid)])
+        named = dict.fromkeys(key for case in self.case for key in self.grid_of(case))
         return [*(key for key in named if key != SEED), SEED]
 
     def grid_of(self, case: SweepCase) -> Grid:
-        """The grid of a case, the seed last."""
-        grid = self.grid | case.grid
+        """The grid of a case, the seed last.
+
+        Raises:
+            SettingsError: If a setting has no list of values.
+        """
+        grid = flat_grid(self.grid) | flat_grid(case.grid)
         return {key: grid[key] for key in sorted(grid, key=lambda key: key == SEED)}
 
 
-def flat_grid(written: Any) -> Any:
+def flat_grid(written: dict[str, Any], above: str = "") -> Grid:
     """A grid with the whole path of every key, however TOML was written.
+
+    Args:
+        written: Lists of values, also in sections.
+        above: Path of the section, with its dot.
+
+    Raises:
+        SettingsError: If a setting has no list of values.
 
     Examples:
         >>> flat_grid({"loop": {"rate_hz": [100, 200]}, "beam.diameter_m": [8]})
         {'loop.rate_hz': [100, 200], 'beam.diameter_m': [8]}
     """
-    if not isinstance(written, dict):
-        return written
-    flat = {}
+    flat: Grid = {}
     for key, values in written.items():
         if isinstance(values, dict):
-            flat |= {f"{key}.{below}": each for below, each in flat_grid(values).items()}
-            continue
-        if not isinstance(values, list | tuple) or not values:
-            raise ValueError(f"{key} must be a list of values, got {toml_value(values)}")
-        flat[key] = values
+            flat |= flat_grid(values, f"{above}{key}.")
+        elif isinstance(values, list) and values and all(isinstance(each, PLAIN) for each in values):
+            flat[above + key] = values
+        else:
+            raise SettingsError(f"grid.{above}{key}", "must be a list of numbers, texts or lists", values)
     return flat
 
 
@@ -144,11 +153,13 @@ def read_sweep(path: Path) -> tuple[Sweep, tuple[Point, ...]]:
         raise FileFormatError(f"{path}: must be TOML, got {error}") from None
     except ValidationError as error:
         raise FileFormatError(f"{path}: {problems_in_words(Sweep, error)[0]}") from None
+    names = [case.name for case in sweep.case]
+    if len(set(names)) < len(names):
+        raise FileFormatError(f"{path}: case.name: must be unique, got {names}")
     points = tuple(_points(path, sweep))
-    names = [point.name for point in points]
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    twice = [name for name, count in Counter(point.name for point in points).items() if count > 1]
     if twice:
-        raise FileFormatError(f"{path}: points must differ in the letters and digits of their settings, got {twice[0]}")
+        raise FileFormatError(f"{path}: points must differ in the letters or digits of a value, got twice {twice[0]}")
     return sweep, points
 
 
@@ -163,25 +174,27 @@ def sweep_file(path: Path) -> Path:
 
 
 def _points(path: Path, sweep: Sweep) -> Iterator[Point]:
-    names = [case.name for case in sweep.case]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise FileFormatError(f"{path}: case.name: must be unique, got twice {twice}")
-    file, keys = (None if sweep.config is None else path.parent / sweep.config), sweep.keys()
+    file = None if sweep.config is None else path.parent / sweep.config
     for case in sweep.case:
-        grid, keep = sweep.grid_of(case), sweep.keep if case.keep is None else case.keep
-        for values in itertools.product(*grid.values()):
-            chosen = dict(zip(grid, values, strict=True))
-            try:
-                config = load_config(file, [*sweep.set, *case.set, *_assignments(chosen)])
-                if config.beam.pupil_map is not None:
-                    raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
-            except SettingsError as error:
-                where = "set" if str(error) == _shared_problem(file, sweep) else f"case {case.name}"
-                raise FileFormatError(f"{path}: {where}: {'; '.join(str(error).splitlines())}") from None
-            name = ",".join([case.name, *(f"{key}={_in_name(value)}" for key, value in chosen.items())])
-            columns = {key: told for key in keys if (told := _told(config, key, chosen)) is not None}
-            yield Point(name, case.name, config, columns, keep, point_digest(config, keep=keep))
+        try:
+            if not NAME.fullmatch(case.name):
+                raise SettingsError("name", "must be letters, digits and . _ + -", case.name)
+            for values in itertools.product(*sweep.grid_of(case).values()):
+                yield _point(sweep, case, file, dict(zip(sweep.grid_of(case), values, strict=True)))
+        except SettingsError as error:
+            where = "set" if str(error) == _shared_problem(file, sweep) else f"case {case.name}"
+            raise FileFormatError(f"{path}: {where}: {'; '.join(str(error).splitlines())}") from None
+
+
+def _point(sweep: Sweep, case: SweepCase, file: Path | None, chosen: dict[str, Any]) -> Point:
+    assigned = [f"{key}={toml_value(value)}" for key, value in chosen.items()]
+    config = load_config(file, [*sweep.set, *case.set, *assigned])
+    if config.beam.pupil_map is not None:
+        raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
+    keep = sweep.keep if case.keep is None else case.keep
+    name = ",".join([case.name, *(f"{key}={_in_name(value)}" for key, value in chosen.items())])
+    columns = {key: told for key in sweep.varied() if (told := _told(config, key, chosen)) is not None}
+    return Point(_shortened(name, LONGEST_NAME), case.name, config, columns, keep, point_digest(config, keep=keep))
 
 
 def point_digest(config: Config, *, keep: bool) -> str:
@@ -197,10 +210,6 @@ def point_digest(config: Config, *, keep: bool) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _assignments(chosen: dict[str, Any]) -> list[str]:
-    return [f"{key}={toml_value(value)}" for key, value in chosen.items()]
-
-
 def _shared_problem(file: Path | None, sweep: Sweep) -> str:
     """What is wrong with the settings that all points share."""
     try:
@@ -212,7 +221,13 @@ def _shared_problem(file: Path | None, sweep: Sweep) -> str:
 
 def _in_name(value: Any) -> str:
     """A value in the name of a point, which is also that of a folder."""
-    return re.sub(r"[^\w.+-]+", "_", str(value) if isinstance(value, str) else toml_value(value))[:60]
+    text = value if isinstance(value, str) else toml_value(value)
+    return _shortened(re.sub(r"[^\w.+-]+", "_", text), LONGEST_VALUE)
+
+
+def _shortened(text: str, longest: int) -> str:
+    """A text that is too long ends with a fingerprint of the whole."""
+    return text if len(text) <= longest else text[: longest - 9] + "~" + hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def _told(config: Config, key: str, chosen: dict[str, Any]) -> str | int | float | None:

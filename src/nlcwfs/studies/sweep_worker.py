@@ -1,18 +1,19 @@
-"""What a worker of dask does for a sweep. Imports no JAX: its environment is set first."""
+"""What a worker of dask does for a sweep.
+
+At run time this module imports nothing of nlcwfs, for that imports JAX, which reads its environment when it is imported.
+"""
 
 import os
 import platform
-import sys
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from distributed import Worker, WorkerPlugin, get_worker
 
-from nlcwfs.studies.sweep_points import Point
-
 if TYPE_CHECKING:
     from nlcwfs.studies.point_run import PointResult, PointRunner
+    from nlcwfs.studies.sweep_points import Point
 
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
 """Matrix products of many threads in many processes fight for the cores."""
@@ -30,16 +31,13 @@ class SweepWorker(WorkerPlugin):
     idempotent = True
 
     def setup(self, worker: Worker) -> None:
-        """Set the environment of JAX, unless the worker has imported it for others."""
+        """Set the environment of JAX; what the user has set stays."""
         self.lock = threading.Lock()
         self._runner: PointRunner | None = None
-        if "jax" not in sys.modules:
-            wanted = jax_environment(os.environ.get("XLA_FLAGS", ""))
-            os.environ.update(
-                {key: text for key, text in wanted.items() if key == "XLA_FLAGS" or key not in os.environ}
-            )
+        wanted = jax_environment(os.environ.get("XLA_FLAGS", ""))
+        os.environ.update({key: text for key, text in wanted.items() if key == "XLA_FLAGS" or key not in os.environ})
 
-    def run(self, point: Point) -> "PointResult":
+    def run(self, point: "Point") -> "PointResult":
         """Run a point."""
         with self.lock:
             if self._runner is None:
@@ -49,7 +47,7 @@ class SweepWorker(WorkerPlugin):
             return self._runner.run(point)
 
 
-def run_on_worker(point: Point) -> "PointResult":
+def run_on_worker(point: "Point") -> "PointResult":
     """Run a point on the worker that dask chose."""
     plugin = get_worker().plugins[SweepWorker.name]
     return plugin.run(point)  # pyright: ignore
