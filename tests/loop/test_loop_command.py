@@ -1,7 +1,12 @@
 """`nlcwfs loop`: the folder that it leaves, and what it says of bad input."""
 
+import errno
 import json
+import os
+import shutil
+import signal
 import sys
+import tempfile
 from pathlib import Path
 
 import aotpy
@@ -15,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "stages"))
 from command_line import type_in
 
 from nlcwfs.commands import loop as command
+from nlcwfs.commands.loop_keeping import Checkpoints
 from nlcwfs.interop import loop_folder as folder_of
 from nlcwfs.simulation.loop import Loop
 from nlcwfs.simulation.loop_run import run_loop
@@ -160,13 +166,140 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path):
     assert "must be a folder that can be written" in result.output
 
 
-def test_a_folder_that_goes_away_is_told(tmp_path, monkeypatch):
-    def gone(running, out, state, records, *, quiet):
-        (out / "config.toml").unlink()
-        out.rmdir()
-        return running.init(), []
+FAST = ["loop.sensor=ideal", "loop.seconds=0.06", "loop.settle_s=0.01"]
 
-    monkeypatch.setattr(command, "_run", gone)
-    result = typed(tmp_path / "run")
+
+def disturbed(monkeypatch, out, disturb):
+    """A run in which something happens at frame 10; checkpoints after every frame, files for rescue beside it."""
+    whole = Loop.step
+
+    def step(self, state):
+        if state.frame == 10:
+            disturb()
+        return whole(self, state)
+
+    monkeypatch.setattr(Loop, "step", step)
+    monkeypatch.setattr(command, "CHECKPOINT_EVERY_S", 0.0)
+    (out.parent / "rescue").mkdir(exist_ok=True)
+    monkeypatch.setattr(tempfile, "tempdir", str(out.parent / "rescue"))
+    return typed(out, settings=FAST)
+
+
+def full_disk(monkeypatch, where):
+    """No file below a folder can be written any more, though some bytes of it are."""
+    whole = Path.write_bytes
+
+    def write(self, data):
+        if self.is_relative_to(where):
+            whole(self, data[:10])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return whole(self, data)
+
+    monkeypatch.setattr(Path, "write_bytes", write)
+
+
+def warnings_in(result):
+    return [line for line in result.stderr.splitlines() if line.startswith("warning: ")]
+
+
+EVERYTHING = {
+    "checkpoint.pickle",
+    "config.toml",
+    "frames.ecsv",
+    "loop.png",
+    "psf.fits",
+    "summary.json",
+    "telemetry.fits",
+}
+
+
+def test_a_folder_that_goes_away_is_told_once_and_made_again(tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    result = disturbed(monkeypatch, out, lambda: shutil.rmtree(out))
+    assert result.exit_code == 0
+    line = f"{out}/checkpoint.pickle: output folder must exist, got no {out}; the run goes on and tries again"
+    assert warnings_in(result) == [f"warning: {line}"]
+    assert {path.name for path in out.iterdir()} == EVERYTHING
+    assert json.loads((out / "summary.json").read_text())["frames"] == 30
+
+
+def test_a_full_disk_costs_no_result(tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    result = disturbed(monkeypatch, out, lambda: full_disk(monkeypatch, out))
     assert result.exit_code == 2
-    assert "must stay where it is during a run" in result.output
+    why = f"{out}/checkpoint.pickle: cannot be written, got No space left on device"
+    (rescue,) = (tmp_path / "rescue").iterdir()
+    assert result.stderr.splitlines() == [
+        f"warning: {why}; the run goes on and tries again",
+        f"nlcwfs: {why}; the run is kept in {rescue}",
+    ]
+    assert "nm rms" in result.stdout
+    assert {path.name for path in out.iterdir()} == {"checkpoint.pickle", "config.toml"}  # both from before, and whole
+    config = small(*FAST)
+    assert len(folder_of.read_checkpoint(out, config)[1]) == 10
+    assert {path.name for path in rescue.iterdir()} == EVERYTHING
+    assert len(folder_of.read_checkpoint(rescue, config)[1]) == 30
+
+
+def test_a_disk_that_is_full_for_a_while_is_told_each_time_it_begins(tmp_path, monkeypatch, capsys):
+    folder, config = tmp_path / "run", small(*FAST)
+    checkpoints = Checkpoints(folder, config)
+    loop = Loop.build(config)
+    state = loop.init()
+    for there in (False, False, True, False):
+        shutil.rmtree(folder, ignore_errors=True)
+        if there:
+            folder.mkdir()
+        checkpoints.write(state, [])
+    assert capsys.readouterr().err.count("the run goes on and tries again") == 2
+
+
+def test_a_run_that_can_be_kept_nowhere_says_so(tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    result = disturbed(monkeypatch, out, lambda: full_disk(monkeypatch, tmp_path))
+    assert result.exit_code == 2
+    (last,) = (line for line in result.stderr.splitlines() if line.startswith("nlcwfs: "))
+    assert "No space left on device; nor can the run be kept elsewhere: " in last
+    assert not list((tmp_path / "rescue").iterdir())
+    assert "nm rms" in result.stdout  # what was found is told all the same
+
+
+def test_a_folder_that_becomes_a_file_costs_no_result(tmp_path, monkeypatch):
+    out = tmp_path / "run"
+
+    def replace():
+        shutil.rmtree(out)
+        out.write_text("")
+
+    result = disturbed(monkeypatch, out, replace)
+    assert result.exit_code == 2
+    assert len(warnings_in(result)) == 1
+    (rescue,) = (tmp_path / "rescue").iterdir()
+    assert f"output folder must be a folder, got the file {out}; the run is kept in {rescue}" in result.stderr
+    assert {path.name for path in rescue.iterdir()} == EVERYTHING
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_told_to_end_keeps_what_is_done(tmp_path, monkeypatch, number):
+    out = tmp_path / "run"
+    before = signal.getsignal(signal.SIGTERM)
+    result = disturbed(monkeypatch, out, lambda: signal.raise_signal(number))
+    assert result.exit_code == 130
+    assert result.stderr == "nlcwfs: interrupted\n"
+    assert f"Kept 10 frames in {out}; --resume goes on." in result.stdout
+    assert len(folder_of.read_checkpoint(out, small(*FAST))[1]) == 10
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_run_that_is_told_to_end_on_a_full_disk_is_kept_elsewhere(tmp_path, monkeypatch):
+    out = tmp_path / "run"
+
+    def both():
+        full_disk(monkeypatch, out)
+        raise KeyboardInterrupt
+
+    result = disturbed(monkeypatch, out, both)
+    assert result.exit_code == 130
+    (rescue,) = (tmp_path / "rescue").iterdir()
+    assert f"No space left on device; the run is kept in {rescue}" in result.stderr
+    assert len(folder_of.read_checkpoint(rescue, small(*FAST))[1]) == 10

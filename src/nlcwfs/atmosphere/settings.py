@@ -57,7 +57,7 @@ class StarSettings(BaseModel):
 
     @property
     def light(self) -> tuple[str, float, float]:
-        """Band, throughput, bandwidth in um; what is left out is as in Guyon 2010: V 13 sends 3.2e6 photons a second."""
+        """Band, throughput, bandwidth in um; what is left out is as in Guyon 2010: V 13 sends 3.2e6 photons/s."""
         throughput = 0.2 if self.throughput is None else self.throughput
         return self.band or "V", throughput, 0.5 if self.bandwidth_um is None else self.bandwidth_um
 

@@ -5,7 +5,8 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import ParamSpec, TypeVar
+from types import FrameType
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import typer
 
@@ -57,15 +58,33 @@ def mendable(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let no Ctrl-C in while results are being saved; signals belong to the main thread."""
+    """Let no Ctrl-C in while results are being saved, nor a request to end; signals belong to the main thread."""
+    with _answered(signal.SIG_IGN, signal.SIGINT, signal.SIGTERM):
+        yield
+
+
+@contextmanager
+def ends_like_ctrl_c() -> Iterator[None]:
+    """Let a request to end (SIGTERM: kill, a batch system) do what Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    with _answered(interrupt, signal.SIGTERM):
+        yield
+
+
+@contextmanager
+def _answered(answer: Callable[[int, FrameType | None], Any] | signal.Handlers, *numbers: int) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = [signal.signal(number, answer) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -2,11 +2,22 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from nlcwfs.commands.console import NOT_A_SUCCESS, device, say, undisturbed, use_precision, warn
+from nlcwfs.commands.console import (
+    NOT_A_SUCCESS,
+    complain,
+    device,
+    ends_like_ctrl_c,
+    say,
+    undisturbed,
+    use_precision,
+    warn,
+)
+from nlcwfs.commands.loop_keeping import Checkpoints, kept
 from nlcwfs.config import Config
 from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.interop import Provenance
@@ -38,13 +49,14 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
     if records:
         say(f"Going on at frame {len(records)} of {config.loop.frames}.", quiet=quiet)
     begun = time.perf_counter()
-    state, records = _run(running, out, state, records, quiet=quiet)
-    seconds = time.perf_counter() - begun
-    stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
+    with ends_like_ctrl_c():
+        state, records = _run(running, out, state, records, quiet=quiet)
     with undisturbed():
-        numbers = _write(running, out, state, records, (seconds, stamp))
-    for line in account(numbers):
-        say(line, quiet=quiet)
+        numbers = summary(running, state, records, time.perf_counter() - begun)
+        for line in account(numbers):  # first, for then they are there whatever becomes of the files
+            say(line, quiet=quiet)
+        stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
+        kept(out, config, lambda folder: _write(running, folder, state, records, (numbers, stamp)))
     say(f"Wrote {out}.", quiet=quiet)
     if numbers["outcome"] != "closed":
         warn(f"the loop is {numbers['outcome']}: {reason(numbers)}")
@@ -58,7 +70,7 @@ def _run(
     """The exposures, with a bar, and a checkpoint now and then and when interrupted."""
     console, settings = Console(stderr=True), running.config.loop
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    last = [time.perf_counter(), state, records]
+    checkpoints, last = Checkpoints(out, running.config), [time.perf_counter(), state, records]
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("loop", total=settings.frames, completed=len(records or []))
 
@@ -67,36 +79,43 @@ def _run(
             bar.update(task, completed=state.frame, description=f"{records[-1].rms_nm:.0f} nm{strehl}")
             last[1:] = [state, records]
             if time.perf_counter() - last[0] > CHECKPOINT_EVERY_S:
-                folder_of.write_checkpoint(out, running.config, state, records)
+                checkpoints.write(state, records)
                 last[0] = time.perf_counter()
 
         try:
             state, records = run_loop(running, state=state, records=records, watch=watch)
         except KeyboardInterrupt:
             with undisturbed():
-                if last[1] is not None:
-                    folder_of.write_checkpoint(out, running.config, last[1], last[2])
-                    say(f"Kept {len(last[2])} frames in {out}; --resume goes on.")
+                _keep_part(out, running.config, *last[1:])
             raise
-    folder_of.write_checkpoint(out, running.config, state, records)
     return state, records
 
 
-def _write(running: Loop, out: Path, state: LoopState, records: list[Record], made: tuple[float, Provenance]) -> dict:
-    """Everything that a run leaves behind."""
+def _keep_part(out: Path, config: Config, state: LoopState | None, records: list[Record] | None) -> None:
+    """Where an interrupted run stands, if it has begun."""
+    if state is None or records is None:
+        return
+    try:
+        kept(out, config, lambda folder: folder_of.write_checkpoint(folder, config, state, records))
+        say(f"Kept {len(records)} frames in {out}; --resume goes on.")
+    except FileFormatError as error:
+        complain(str(error))
+
+
+def _write(
+    running: Loop, folder: Path, state: LoopState, records: list[Record], made: tuple[dict[str, Any], Provenance]
+) -> None:
+    """Everything that a run leaves behind; the summary is last, and tells that the rest is there."""
     from nlcwfs.studies.loop_picture import draw_loop
 
-    seconds, stamp = made
-    if not out.is_dir():
-        raise FileFormatError(f"{out}: must stay where it is during a run, got no such folder")
-    numbers = summary(running, state, records, seconds)
-    folder_of.write_summary(out, numbers, stamp)
-    folder_of.write_records(out, running, records, stamp)
-    folder_of.write_telemetry(out, running, state, records, stamp)
+    numbers, stamp = made
+    folder_of.write_checkpoint(folder, running.config, state, records)
+    folder_of.write_records(folder, running, records, stamp)
+    folder_of.write_telemetry(folder, running, state, records, stamp)
     if int(state.image.exposures):
-        folder_of.write_image(out, state, stamp)
-    draw_loop(out / folder_of.PICTURE, running, state, records, floor_nm=numbers["bounds"]["floor_nm"])
-    return numbers
+        folder_of.write_image(folder, state, stamp)
+    draw_loop(folder / folder_of.PICTURE, running, state, records, floor_nm=numbers["bounds"]["floor_nm"])
+    folder_of.write_summary(folder, numbers, stamp)
 
 
 def account(numbers: dict) -> list[str]:

@@ -3,7 +3,7 @@
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nlcwfs.errors import FileFormatError
@@ -43,7 +43,7 @@ def check_writable(path: str | Path) -> None:
     except OSError as error:
         raise FileFormatError(f"{path}: output folder must be writable, got {error.strerror}") from None
     finally:
-        trial.unlink(missing_ok=True)
+        _remove(trial)
 
 
 @contextmanager
@@ -76,7 +76,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be written, got {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
+
+
+def _remove(path: Path) -> None:
+    """Take a temporary file away; where that cannot be done, its folder is gone, or can no longer be written."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def _beside(path: Path) -> Path:

@@ -43,8 +43,12 @@ def prepare_folder(folder: Path, config: Config, *, resume: bool) -> None:
         raise FileFormatError(f"{folder}: must be a folder that can be written, got {error.strerror}") from None
     if (folder / CONFIG).exists() and not resume:
         raise FileFormatError(f"{folder}: must be empty or new, got a folder with a run (--resume goes on with it)")
-    if resume and (folder / CHECKPOINT).exists():
-        return
+    if not (resume and (folder / CHECKPOINT).exists()):
+        write_config(folder, config)
+
+
+def write_config(folder: Path, config: Config) -> None:
+    """The settings of a run."""
     with atomic_write(folder / CONFIG) as path:
         path.write_text(to_toml(config), encoding="utf-8")
 
