@@ -12,10 +12,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from nlcwfs.commands.console import NOT_A_SUCCESS, complain, say, undisturbed, warn
 from nlcwfs.errors import FileFormatError
 from nlcwfs.interop import Provenance, check_writable
+from nlcwfs.studies.image_profiles import keep_profiles
 from nlcwfs.studies.study_figures import draw_figures
 from nlcwfs.studies.study_table import Row, StudyTable
 from nlcwfs.studies.sweep_cluster import connected, cores, local_cluster
-from nlcwfs.studies.sweep_figures import SWEEP_FIGURES, check_figures
+from nlcwfs.studies.sweep_figures import check_figures, drawings_of
 from nlcwfs.studies.sweep_points import Point, Sweep, read_sweep, sweep_file
 from nlcwfs.studies.sweep_report import write_sweep_report
 from nlcwfs.studies.sweep_run import WORKERS, missing_points, rows_of, run_sweep
@@ -119,7 +120,8 @@ def _written(folder: Path, asked: Sweep, points: Sequence[Point], table: StudyTa
     stamp = Provenance.collect(asked.model_dump(mode="json"), seed=None, device=WORKERS)
     table.sort([point.name for point in points], stamp, others=True)
     rows = rows_of(points, table)
-    pictures = draw_figures(folder, asked.figures, rows, SWEEP_FIGURES)
+    keep_profiles(folder, rows, stamp)
+    pictures = draw_figures(folder, asked.figures, rows, drawings_of(folder))
     page = write_sweep_report(folder, asked, rows, pictures)
     failed = [row for row in rows if row["error"]]
     others = len(table.rows) - len(rows)

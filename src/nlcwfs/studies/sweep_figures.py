@@ -1,12 +1,33 @@
 """The figures that a sweep asks for, drawn from the rows of its table."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
-from nlcwfs.errors import FileFormatError
-from nlcwfs.studies.study_figures import Drawings
+from matplotlib.figure import Figure
 
-SWEEP_FIGURES: Drawings = {}
-"""What `figures = [...]` of a sweep may name; here a drawing and its caption join."""
+from nlcwfs.errors import FileFormatError
+from nlcwfs.studies.loop_figures import draw_images, draw_rates
+from nlcwfs.studies.study_figures import Drawings
+from nlcwfs.studies.study_table import Row
+
+SWEEP_FIGURES: dict[str, tuple[Callable[[Path, Sequence[Row]], Figure | None], str]] = {
+    "rates": (
+        draw_rates,
+        "What is left against the rate: median and range over the seeds. Dashed, in the same color: the bound of "
+        "mirror, lag of one exposure and quantum limit.",
+    ),
+    "images": (
+        draw_images,
+        "The star behind the loop, mean over rings around the axis, each relative to the peak of a perfect telescope.",
+    ),
+}
+"""What `figures = [...]` of a sweep may name: a drawing and its caption."""
+
+
+def drawings_of(folder: Path) -> Drawings:
+    """The same for the sweep in a folder."""
+    return {name: (partial(draw, folder), caption) for name, (draw, caption) in SWEEP_FIGURES.items()}
 
 
 def check_figures(path: Path, names: tuple[str, ...]) -> None:
