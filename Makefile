@@ -37,6 +37,8 @@ pytest: $(VENV)/.installed-dev  ## Tests and the examples in the docstrings
 studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that take minutes
 	$(BIN)/nlcwfs study studies/01-single-frame
 	$(BIN)/nlcwfs study studies/02-every-method
+	$(BIN)/nlcwfs sweep studies/03-closed-loop
+	$(BIN)/nlcwfs sweep studies/05-fewer-planes
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs
