@@ -41,9 +41,10 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sweep studies/05-fewer-planes
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
-bench: $(VENV)/.installed  ## Time of the reconstructor against that of its own FFTs
+bench: $(VENV)/.installed  ## Time of the reconstructors against that of their own FFTs, and of a frame of the loop
 	$(BIN)/python bench/gerchberg_saxton.py
 	$(BIN)/python bench/maximum_a_posteriori.py
+	$(BIN)/python bench/loop_speed.py
 
 clean:  ## Back to a fresh clone, but for changes of yours
 	rm -rf $(VENV) docs/_build docs/_generated demo dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache

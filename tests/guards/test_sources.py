@@ -41,7 +41,6 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.interop.loop_folder:write_telemetry": "needs a run of the loop",
     "nlcwfs.interop.loop_folder:write_records": "needs a run of the loop",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
-    "nlcwfs.simulation.loop_faults:bump_m": "needs a loop",
     "nlcwfs.simulation.loop_faults:damaged": "needs an exposure",
     "nlcwfs.simulation.loop_run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",
     "nlcwfs.simulation.loop_run:summary": "needs a run of the loop",

@@ -10,6 +10,7 @@ from small_loop import small
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.simulation.loop import GROUPS, Loop
+from nlcwfs.simulation.loop_faults import bump_shape
 from nlcwfs.simulation.loop_run import MISSING, LoopTelemetry, loop_bounds, run_loop, summary
 
 
@@ -96,6 +97,17 @@ def test_it_survives(fault):
     assert np.isfinite(told.command_m).all()
     assert found["outcome"] == "closed"
     assert np.median(told.rms_nm[-20:]) < 1.4 * np.median(told.rms_nm[30:40])
+
+
+def test_a_bump_has_its_rms_and_a_shape_of_its_own():
+    light = built("loop.sensor=ideal").light
+    shape = np.asarray(bump_shape(light), float)
+    weights = np.asarray(light.weights, float)
+    assert np.sum(weights * shape**2) == pytest.approx(1, rel=1e-5)  # rounding of single precision
+    assert np.sum(weights * shape) == pytest.approx(0, abs=1e-3)  # a mirror makes no piston, dim rim pixels aside
+    ramp = (np.arange(shape.shape[1]) - (shape.shape[1] - 1) / 2)[None, :] * np.ones_like(shape)
+    ramp /= np.sqrt(np.sum(weights * ramp**2))
+    assert abs(np.sum(weights * shape * ramp)) < 0.99  # not a tilt alone
 
 
 def test_a_star_too_faint_cannot_be_followed():

@@ -1,5 +1,6 @@
 """The closed loop: a step for every exposure, a line for every stage of the light."""
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from nlcwfs.feedback.state import FeedbackState
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.science.rms_groups import rms_groups
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_faults import bump_m, damaged, fault_in
+from nlcwfs.simulation.loop_faults import bump_rms_m, bump_shape, damaged, fault_in
 from nlcwfs.simulation.loop_light import LoopLight
 from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor
 from nlcwfs.simulation.loop_sight import Sight
@@ -110,8 +111,8 @@ class Loop:
         """One exposure: air, mirror, light, detector, wavefront, command."""
         light, settings, line = self.light, self.config.loop, state.control.line
         fault = fault_in(settings, state.frame)
-        bump = bump_m(settings, light, state.frame)
-        corrected = light.expose(jnp.asarray(state.frame, jnp.int32), line, state.image, bump)
+        bump_m = bump_rms_m(settings, state.frame) * self._bump
+        corrected = light.expose(jnp.asarray(state.frame, jnp.int32), line, state.image, bump_m)
         arrived = damaged(fault, corrected.exposure, state.before)
         sight, memory, control = None, state.memory, None
         if arrived is not None:
@@ -133,6 +134,11 @@ class Loop:
             command_m=np.asarray(line.mean_m),
         )
         return LoopState(state.frame + 1, control, memory, image, closed_at, corrected.exposure), record
+
+    @cached_property
+    def _bump(self) -> Float[Array, "lit_y lit_x"]:
+        """Of unit rms; made once, for the mirror and the pupil of a loop stay what they are."""
+        return bump_shape(self.light)
 
     def _measured(self, arrived: Exposure, command_m: Float[Array, " mode"], memory: Any) -> tuple[Sight, Any]:
         electrons = arrived.frames.electrons - self.light.still.detector.background_electrons

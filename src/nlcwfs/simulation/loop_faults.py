@@ -24,16 +24,24 @@ def fault_in(settings: LoopSettings, frame: int) -> str:
     return settings.fault if first <= frame < last else "none"
 
 
-def bump_m(settings: LoopSettings, light: LoopLight, frame: int) -> Float[Array, "lit_y lit_x"]:
-    """The bump's wavefront in a frame: another piece of turbulence, of the given rms, from its beginning on."""
-    flat = jnp.zeros_like(light.weights)
-    if settings.fault != "bump" or frame < round(settings.fault_at_s * settings.rate_hz):
-        return flat
+def bump_rms_m(settings: LoopSettings, frame: int) -> float:
+    """Rms of the bump in a frame; it stays once it has begun.
+
+    Examples:
+        >>> settings = LoopSettings(rate_hz=100, fault="bump", fault_at_s=0.1, bump_nm=300)
+        >>> [round(1e9 * bump_rms_m(settings, frame)) for frame in (9, 10, 99)]
+        [0, 300, 300]
+    """
+    begun = settings.fault == "bump" and frame >= round(settings.fault_at_s * settings.rate_hz)
+    return settings.bump_nm * 1e-9 if begun else 0.0
+
+
+def bump_shape(light: LoopLight) -> Float[Array, "lit_y lit_x"]:
+    """The bump of unit rms: another piece of turbulence that the mirror can hold."""
     falls = np.maximum(np.asarray(light.mirror.cycles_per_aperture), 0.5) ** (-11 / 6)  # Kolmogorov's amplitudes
-    noise = jax.random.normal(jax.random.key(7), (light.mirror.count,), flat.dtype)
-    shape_m = light.mirror.opd_m(noise * jnp.asarray(falls * 1e-9, flat.dtype))
-    rms_m = jnp.sqrt(jnp.sum(light.weights * shape_m**2))
-    return shape_m * (settings.bump_nm * 1e-9 / rms_m)
+    noise = jax.random.normal(jax.random.key(7), (light.mirror.count,), light.weights.dtype)
+    shape_m = light.mirror.opd_m(noise * jnp.asarray(falls * 1e-9, noise.dtype))
+    return shape_m / jnp.sqrt(jnp.sum(light.weights * shape_m**2))
 
 
 def damaged(fault: str, exposure: Exposure, before: Exposure | None) -> Exposure | None:
