@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from tests.loop.small_loop import small
-from tests.sweep.small_sweep import numbers, written
+from tests.sweep.small_sweep import written
 
 from nlcwfs.simulation.loop import Loop
 from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from, run_loop, summary
@@ -62,14 +62,14 @@ def test_a_row_holds_the_numbers_of_the_loop(tmp_path):
 
 
 def test_a_mirror_serves_all_seeds_and_no_other_setting(tmp_path, monkeypatch):
-    points = points_of(tmp_path, "[grid]\nseed = [0, 1]\nmirror.cutoff_cpa = [4, 5]\n")
+    points = points_of(tmp_path, "[grid]\nmirror.cutoff_cpa = [5, 4]\nseed = [0, 1]\n")
     build, built = Loop.build, []
     monkeypatch.setattr(point_run.Loop, "build", lambda config: built.append(config) or build(config))
     runner = PointRunner()
-    rows = [runner.run(point).row for point in points]
-    assert [config.mirror.cutoff_cpa for config in built] == [4, 5]
-    assert len({row["rms_nm"] for row in rows}) == 4
-    assert numbers(PointRunner().run(points[-1]).row) == numbers(rows[-1])
+    rows = [runner.run(point).row for point in points[:3]]
+    assert [config.mirror.cutoff_cpa for config in built] == [5, 4]
+    assert [row["seed"] for row in rows] == [0, 1, 0]
+    assert len({row["rms_nm"] for row in rows}) == 3
 
 
 def test_what_goes_wrong_is_a_row_and_the_next_point_runs(tmp_path, monkeypatch):

@@ -40,7 +40,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
         warnings.filterwarnings("ignore", message="Port .* is already in use")
         cluster = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, silence_logs=logging.CRITICAL)
     with cluster, Client(cluster) as client:
-        client.register_plugin(SweepWorker())
+        client.register_plugin(SweepWorker(deaf=True))
         yield client
 
 

@@ -1,10 +1,11 @@
 """What a worker of dask does for a sweep.
 
-At run time this module imports nothing of nlcwfs, for that imports JAX, which reads its environment when it is imported.
+At run time this module imports nothing of nlcwfs: that imports JAX, which reads its environment only then.
 """
 
 import os
 import platform
+import signal
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,7 @@ class SweepWorker(WorkerPlugin):
     """Prepares a worker, also one that joins or is started again in the midst; keeps the last loop for the next seed.
 
     Attributes:
+        deaf: Whether Ctrl-C is for the command alone, which then ends its workers; as they share a terminal.
         name: By which the worker knows it.
         lock: A worker of many threads computes one point at a time, for precision is a setting of the process.
     """
@@ -30,10 +32,15 @@ class SweepWorker(WorkerPlugin):
     name = "nlcwfs-sweep"
     idempotent = True
 
+    def __init__(self, *, deaf: bool = False) -> None:
+        self.deaf = deaf
+
     def setup(self, worker: Worker) -> None:
         """Set the environment of JAX; what the user has set stays."""
         self.lock = threading.Lock()
         self._runner: PointRunner | None = None
+        if self.deaf and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         wanted = jax_environment(os.environ.get("XLA_FLAGS", ""))
         os.environ.update({key: text for key, text in wanted.items() if key == "XLA_FLAGS" or key not in os.environ})
 
