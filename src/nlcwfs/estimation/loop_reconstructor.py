@@ -12,6 +12,10 @@ ROUNDS = 6
 """Rounds of prediction and measurement after which the prior of a loop has settled to a percent."""
 
 
+FACTOR = 16.0
+START = 8.0
+
+
 class LoopModes(NamedTuple):
     """What is known of the modes before anything is measured.
 
@@ -83,9 +87,9 @@ def loop_reconstructor(
     moved = known.moved_m2 / known.open_m2[:driven]
     prior = np.ones(driven)
     if closed:
-        prior = np.minimum(1, 4 * moved)
+        prior = np.minimum(1, START * moved)
         for _ in range(ROUNDS):
-            prior = np.minimum(1, _left(fisher, prior) + moved)
+            prior = np.minimum(1, _left(fisher, prior) + FACTOR * moved)
     inverse = np.linalg.inv(fisher + np.diag(1 / prior))
     matrix = inverse @ (first.T - cross.T @ rest.T)
     matrix *= amplitude_m[:driven, None] / noise_rad[None, :]

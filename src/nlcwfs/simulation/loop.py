@@ -36,7 +36,7 @@ class LoopState(NamedTuple):
         memory: The reconstructor's.
         image: The star's image since the loop settled.
         closed_at: Frame at which the loop closed; -1 before.
-        before: The exposure that arrived last; for a detector that sends it twice.
+        before: The exposure that arrived last, where a detector is to send it twice; else None.
     """
 
     frame: int
@@ -132,7 +132,8 @@ class Loop:
             sight=sight,
             command_m=np.asarray(line.mean_m),
         )
-        return LoopState(state.frame + 1, control, memory, image, closed_at, corrected.exposure), record
+        before = corrected.exposure if settings.fault == "doubled-frames" else None  # else too large to keep
+        return LoopState(state.frame + 1, control, memory, image, closed_at, before), record
 
     def _measured(self, arrived: Exposure, command_m: Float[Array, " mode"], memory: Any) -> tuple[Sight, Any]:
         electrons = arrived.frames.electrons - self.light.still.detector.background_electrons
