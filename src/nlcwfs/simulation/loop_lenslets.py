@@ -203,6 +203,12 @@ def blurred(
     r"""A spot after a long exposure through turbulence: its transfer function times that of the air.
 
     :math:`\exp(-3.44 (\lambda u / r_0)^{5/3})` at the angular frequency u (Fried 1966).
+
+    Examples:
+        >>> spot = jnp.zeros((1, 9, 9)).at[0, 4, 4].set(1.0)
+        >>> wide = blurred(spot, 1e-6, 0.85e-6, 0.3)
+        >>> round(float(wide.sum()), 2), bool(wide[0, 4, 4] < 0.2)
+        (0.93, True)
     """
     _, rows, columns = spot.shape
     u = np.hypot(np.fft.fftfreq(2 * rows, pixel_rad)[:, None], np.fft.rfftfreq(2 * columns, pixel_rad)[None, :])
