@@ -162,7 +162,7 @@ def weighted_centre_of_gravity(model: SpotModel, *, fwhm_rad: float) -> SpotFilt
     return _calibrated(model, angle_y * weight, angle_x * weight, weight, 0.0)
 
 
-def matched_filter(model: SpotModel, *, extra_electrons2: float = 0.0) -> SpotFilter:
+def matched_filter(model: SpotModel, *, extra_electrons2: float | Float[Array, ""] = 0.0) -> SpotFilter:
     r"""The most likely small shift of a known spot of unknown brightness.
 
     The noise-optimal matched filter of Gilles & Ellerbroek (2006, Appl. Opt. 45, 6568), for photon noise: weights

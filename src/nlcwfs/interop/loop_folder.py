@@ -16,6 +16,7 @@ from nlcwfs.config import Config, digest, to_toml
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.errors import FileFormatError
 from nlcwfs.interop.atomic_write import atomic_write
+from nlcwfs.interop.loop_sensor_aot import aot_sensor
 from nlcwfs.interop.provenance import Provenance
 from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
 from nlcwfs.simulation.loop_run import LoopTelemetry
@@ -117,16 +118,8 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
     telescope = aotpy.MainTelescope("telescope", enclosing_diameter=still.shape.diameter_m)
     star = aotpy.NaturalGuideStar("star")
     detector = aotpy.Detector("detector", frame_rate=rate_hz, integration_time=1 / rate_hz)
-    sensor = aotpy.Pyramid(  # the standard knows no curvature sensor; four pupil images come nearest
-        "sensor",
-        source=star,
-        n_sides=still.sensor.transfer.shape[1],
-        dimensions=1,
-        detector=detector,
-        wavelength=loop.config.beam.wavelength_um * 1e-6,
-        measurements=aotpy.Image("measured modes", told.measured_m[:, None, :].astype(np.float32), unit="m", time=time),
-        n_valid_subapertures=told.measured_m.shape[1],
-    )
+    measured = aotpy.Image("measured modes", told.measured_m[:, None, :].astype(np.float32), unit="m", time=time)
+    sensor = aot_sensor(loop, star, detector, measured)
     mirror = aotpy.DeformableMirror("mirror", telescope=telescope, n_valid_actuators=loop.light.mirror.count)
     control = aotpy.ControlLoop(
         "loop",
@@ -135,6 +128,7 @@ def write_telemetry(folder: Path, loop: Loop, state: LoopState, records: list[Re
         time=time,
         closed=state.closed_at >= 0,
         commands=aotpy.Image("commands", told.command_m.astype(np.float32), unit="m", time=time),
+        residual_commands=measured,
         framerate=rate_hz,
         delay=loop.config.feedback.latency_frames / rate_hz,
     )

@@ -37,7 +37,7 @@ class LoopState(NamedTuple):
         memory: The reconstructor's.
         image: The star's image since the loop settled.
         closed_at: Frame at which the loop closed; -1 before.
-        before: The exposure that arrived last; for a detector that sends it twice.
+        before: The exposure that arrived last, where a detector is to send it twice; else None.
     """
 
     frame: int
@@ -133,7 +133,8 @@ class Loop:
             sight=sight,
             command_m=np.asarray(line.mean_m),
         )
-        return LoopState(state.frame + 1, control, memory, image, closed_at, corrected.exposure), record
+        before = corrected.exposure if settings.fault == "doubled-frames" else None  # else too large to keep
+        return LoopState(state.frame + 1, control, memory, image, closed_at, before), record
 
     @cached_property
     def _bump(self) -> Float[Array, "lit_y lit_x"]:

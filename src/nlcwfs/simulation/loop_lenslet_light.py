@@ -133,7 +133,7 @@ def keys_cubic(points: Float[np.ndarray, " point"], count: int) -> Float[np.ndar
         >>> keys_cubic(np.array([1.5, 2.0]), 4).tolist()
         [[-0.0625, 0.5625, 0.5625, -0.0625], [0.0, 0.0, 1.0, 0.0]]
     """
-    x = np.abs(points[:, None] - np.arange(-2, count + 2)[None, :])
+    x = np.abs(np.clip(points, 0, count - 1)[:, None] - np.arange(-2, count + 2)[None, :])
     near, far = 1.5 * x**3 - 2.5 * x**2 + 1, -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2
     wide = np.where(x < 1, near, np.where(x < 2, far, 0.0))
     inner = wide[:, 2:-2]

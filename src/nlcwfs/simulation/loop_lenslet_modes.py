@@ -136,7 +136,8 @@ def moved_share(config: Config, cycles: Float[np.ndarray, " mode"]) -> Float[np.
     sky = config.atmosphere
     turn = 2 * np.pi * cycles / config.beam.diameter_m / config.loop.rate_hz
     layers = zip(sky.layer_fractions, sky.wind_speeds_m_per_s, strict=True)
-    return sum(share * 2 * (1 - scipy.special.j0(turn * speed)) for share, speed in layers)
+    moved = [share * 2 * (1 - scipy.special.j0(turn * speed)) for share, speed in layers]
+    return np.sum(moved, axis=0)
 
 
 def _ideal_modes(config: Config, light: LoopLight, cutoff: float) -> Mirror:
@@ -145,4 +146,5 @@ def _ideal_modes(config: Config, light: LoopLight, cutoff: float) -> Mirror:
     fastest = float(np.max(light.mirror.cycles_per_aperture))
     settings = MirrorSettings(kind="karhunen-loeve", cutoff_cpa=min(cutoff, fastest))
     pupil = still.shape.on(light.part)
-    return Mirror.build(settings, pupil, light.part, diameter_m=still.shape.diameter_m)
+    dtype = str(light.weights.dtype)
+    return Mirror.build(settings, pupil, light.part, diameter_m=still.shape.diameter_m, dtype=dtype)

@@ -191,7 +191,7 @@ class FollowedSpots(eqx.Module):
         (spot, matrix), (total, memory) = known, numbers
         electrons, whole = self._window(electrons), jnp.all(self._window(usable), axis=(1, 2))
         slopes = self.filter_of(spot, total).measure_faint(electrons, self.light)
-        weight = slopes.weight * whole
+        weight = slopes.weight * whole.astype(slopes.weight.dtype)
         residual_m = matrix @ (slopes.slope * weight[:, None]).ravel()
         seen = MeanSpot(spot, 0.0).updated(electrons).shape
         return residual_m, memory * spot + (1 - memory) * seen
@@ -203,9 +203,16 @@ def blurred(
     r"""A spot after a long exposure through turbulence: its transfer function times that of the air.
 
     :math:`\exp(-3.44 (\lambda u / r_0)^{5/3})` at the angular frequency u (Fried 1966).
+
+    Examples:
+        >>> spot = jnp.zeros((1, 9, 9)).at[0, 4, 4].set(1.0)
+        >>> wide = blurred(spot, 1e-6, 0.85e-6, 0.3)
+        >>> round(float(wide.sum()), 2), bool(wide[0, 4, 4] < 0.2)
+        (0.93, True)
     """
     _, rows, columns = spot.shape
     u = np.hypot(np.fft.fftfreq(2 * rows, pixel_rad)[:, None], np.fft.rfftfreq(2 * columns, pixel_rad)[None, :])
-    transfer = jnp.asarray(np.exp(-3.44 * (wavelength_m * u / fried_m) ** (5 / 3)), spot.dtype)
-    wide = jnp.fft.irfft2(jnp.fft.rfft2(spot, s=(2 * rows, 2 * columns)) * transfer, s=(2 * rows, 2 * columns))
-    return jnp.maximum(wide[:, :rows, :columns], 0)
+    transfer = np.exp(-3.44 * (wavelength_m * u / fried_m) ** (5 / 3))
+    spectrum = np.fft.rfft2(np.asarray(spot, float), s=(2 * rows, 2 * columns))
+    wide = np.fft.irfft2(spectrum * transfer, s=(2 * rows, 2 * columns))
+    return jnp.asarray(np.maximum(wide[:, :rows, :columns], 0), spot.dtype)

@@ -59,7 +59,7 @@ class LoopSettings(BaseModel):
     fault: Literal["none", "nan-frames", "lost-frames", "doubled-frames", "dead-plane", "bump"] = Field(
         default="none",
         description="What goes wrong on purpose: frames of NaN, frames that do not come, old frames again, the first "
-        "plane dark, or a bump in the wavefront that stays.",
+        "plane dark (or a quarter of the spots), or a bump in the wavefront that stays.",
     )
     fault_at_s: float = Field(default=0.5, ge=0, description="When it begins.")
     fault_s: float = Field(default=0.05, gt=0, description="How long it lasts.")

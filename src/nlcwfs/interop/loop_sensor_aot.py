@@ -1,0 +1,31 @@
+"""The sensor of a loop in the words of the AO telemetry standard (AOT)."""
+
+import aotpy
+import numpy as np
+
+from nlcwfs.simulation.loop import Loop
+from nlcwfs.simulation.loop_lenslet_light import LensletOptics
+
+
+def aot_sensor(
+    loop: Loop, star: aotpy.NaturalGuideStar, detector: aotpy.Detector, measured: aotpy.Image
+) -> aotpy.ShackHartmann | aotpy.Pyramid:
+    """A sensor with what it measured, modes of the mirror instead of slopes."""
+    optics = loop.light.optics
+    common = {"source": star, "detector": detector, "wavelength": loop.config.beam.wavelength_um * 1e-6}
+    if isinstance(optics, LensletOptics):
+        lattice = optics.sensor.active
+        number = np.where(lattice, np.cumsum(lattice).reshape(lattice.shape) - 1, -1)  # -1: does not serve
+        return aotpy.ShackHartmann(
+            "sensor",
+            n_valid_subapertures=optics.sensor.count,
+            subaperture_mask=aotpy.Image("subaperture mask", number),
+            subaperture_size=optics.sensor.subaperture_m,
+            centroiding_algorithm=loop.config.shack_hartmann.centroid,
+            **common,
+        )
+    # the standard knows no curvature sensor; pupil images side by side come nearest
+    sides, modes = loop.light.still.sensor.transfer.shape[1], measured.data.shape[2]
+    return aotpy.Pyramid(
+        "sensor", n_sides=sides, dimensions=1, measurements=measured, n_valid_subapertures=modes, **common
+    )
