@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
+from nlcwfs.estimation.map_verdict import UNEXPLAINED
 from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.resolution_level import sum_blocks
@@ -129,6 +130,16 @@ class FollowedCurvature(eqx.Module):
         estimate, after = how(self.reconstructor, counts, usable, *memory, read_variance=noise, known_m=known_m)
         return estimate, after, self.pixels(estimate.opd_m)
 
+    def _without_islands(
+        self, counts: Array, usable: Array, mirror_m: Array, memory: Memory, residual_m: Array
+    ) -> tuple[int, Memory, Float[Array, " mode"], int]:
+        """How many islands a second look at the frame brings back, memory and residual then, and its FFTs."""
+        known_m, noise = -self.on_model(mirror_m), self.read_variance
+        looked = self.second.look(counts, usable, memory, read_variance=noise, known_m=known_m)
+        if looked.turned:
+            residual_m = residual_m + self._change_m(looked.change_rad)
+        return looked.turned, looked.memory, residual_m, looked.ffts
+
     @eqx.filter_jit
     def _change_m(self, change_rad: Float[Array, "Y X"]) -> Float[Array, " mode"]:
         """What a change of the phase on the model's grid is in modes."""
@@ -147,20 +158,23 @@ class FollowedCurvature(eqx.Module):
         counts = exposure.frames.electrons
         if state.memory is None or state.sure < SURE:
             estimate, begun, residual_m = self._looked(SequenceReconstructor.start, counts, usable, mirror_m, ())
-            outcome = Outcome(int(estimate.outcome_code))
+            outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
+            if outcome not in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+                turned, begun, residual_m, more = self._without_islands(counts, usable, mirror_m, begun, residual_m)
+                ffts += more
+                if not turned and float(estimate.unexplained) < UNEXPLAINED and not outcome.succeeded:
+                    outcome = Outcome.BUDGET_SPENT  # healing went astray, but nothing more likely was found
             sure = state.sure + 1 if outcome.succeeded else 0
             after = FollowedState(begun if outcome.succeeded else None, 0, 0, sure)
-            return self._sight(estimate, residual_m, outcome, closed=sure >= SURE), after
+            sight = self._sight(estimate, residual_m, outcome, closed=sure >= SURE)._replace(ffts=ffts)
+            return sight, after
         seen = counts, usable, mirror_m
         estimate, followed, residual_m = self._looked(SequenceReconstructor.follow, *seen, (state.memory,))
         outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
         doubts, since = 0 if outcome.succeeded else state.doubts + 1, state.since + 1
         if outcome.succeeded and self.look_again_every and since >= self.look_again_every:
-            known_m, noise = -self.on_model(mirror_m), self.read_variance
-            looked = self.second.look(counts, usable, followed, read_variance=noise, known_m=known_m)
-            followed, ffts, since = looked.memory, ffts + looked.ffts, 0
-            if looked.turned:
-                residual_m = residual_m + self._change_m(looked.change_rad)
+            _, followed, residual_m, more = self._without_islands(*seen, followed, residual_m)
+            ffts, since = ffts + more, 0
         if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             followed = self.reconstructor.skip(state.memory)
         lost = doubts >= DOUBTS
