@@ -42,6 +42,7 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.interop.loop_folder:write_records": "needs a run of the loop",
     "nlcwfs.interop.loop_sensor_aot:aot_sensor": "needs a loop",
     "nlcwfs.simulation.loop_lenslet_modes:slopes_of_cells": "needs the optics of a loop",
+    "nlcwfs.simulation.loop_lenslet_modes:waves_between": "needs a loop's light",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
     "nlcwfs.simulation.loop_faults:damaged": "needs an exposure",
     "nlcwfs.simulation.loop_run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",

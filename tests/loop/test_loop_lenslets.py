@@ -168,14 +168,14 @@ def test_a_star_without_light_is_told_and_nothing_moves():
 
 
 def test_read_noise_is_read_and_reckoned_with():
-    """1 electron on 256 pixels a spot of 50 photons: more is left than without, far less than the open loop's."""
-    few = ("shack_hartmann.pixels=16", "detector.read_noise_electrons=1")
+    """3 electrons on 256 pixels a spot of 50 photons: more is left than without, far less than the open loop's."""
+    few = ("shack_hartmann.pixels=16", "detector.read_noise_electrons=3")
     loop = built(*few)
     _, noisy = ran(loop, *few)
     electrons = np.asarray(exposed(loop, 0, np.zeros(loop.light.mirror.count)).exposure.frames.electrons)
-    assert electrons.min() < -3  # which photons alone never are
+    assert electrons.min() < -9  # which photons alone never are
     _, quiet = ran(built(few[0]), few[0])
-    assert 1.05 * quiet["rms_nm"] < noisy["rms_nm"] < 2.5 * quiet["rms_nm"]
+    assert 1.1 * quiet["rms_nm"] < noisy["rms_nm"] < 2.5 * quiet["rms_nm"]
 
 
 def test_modes_that_lenslets_do_not_see_are_not_driven():
@@ -251,7 +251,7 @@ def test_a_run_leaves_a_folder_that_the_standard_reads(tmp_path):
     result = type_in("loop", "--out", out, *settings)
     assert result.exit_code == 0, result.output
     assert json.loads((out / "summary.json").read_text())["outcome"] == "closed"
-    system = aotpy.read_system_from_file(str(out / "telemetry.fits"))
+    system = aotpy.AOSystem.read_from_file(str(out / "telemetry.fits"))
     (sensor,) = system.wavefront_sensors
     assert isinstance(sensor, aotpy.ShackHartmann)
     assert sensor.n_valid_subapertures == np.sum(np.asarray(sensor.subaperture_mask.data) >= 0) == 76
