@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +10,11 @@ from small_loop import small
 
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.second_look import Looked, SecondLook
+from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.simulation.loop import GROUPS, Loop
 from nlcwfs.simulation.loop_faults import bump_shape
+from nlcwfs.simulation.loop_measurement import FollowedCurvature
 from nlcwfs.simulation.loop_run import MISSING, LoopTelemetry, loop_bounds, run_loop, summary
 
 
@@ -45,6 +49,29 @@ def test_an_ideal_sensor_leaves_what_numpy_computes():
         expected.append(np.sqrt(np.mean(np.sum(weights[lit] * left**2, axis=1))))
         command = command + np.linalg.lstsq((shapes * root).T, left.mean(axis=0) * root, rcond=1e-6)[0]
     np.testing.assert_allclose(told.rms_nm * 1e-9, expected, rtol=2e-3)  # single precision, dim rim pixels not fitted
+
+
+@pytest.mark.parametrize(("unexplained", "turned", "believed"), [(0.1, 0, True), (0.1, 1, False), (0.4, 0, False)])
+def test_an_open_loop_believes_what_nothing_more_likely_was_found_for(monkeypatch, unexplained, turned, believed):
+    """Two solutions may differ because healing went astray. A second look decides, if the light is explained."""
+    loop = built()
+    sensor = loop.measurement
+    begun, flat_m = loop.init(), jnp.zeros_like(loop.light.weights)
+    exposure = loop.light.expose(jnp.asarray(0, jnp.int32), begun.control.line, begun.image, flat_m).exposure
+    usable, mirror_m = jnp.ones(exposure.frames.electrons.shape, bool), flat_m
+    doubted = sensor._looked(SequenceReconstructor.start, exposure.frames.electrons, usable, mirror_m, ())
+    estimate = eqx.tree_at(
+        lambda one: (one.outcome_code, one.unexplained),
+        doubted[0],
+        (jnp.asarray(Outcome.NOT_EXPLAINED, jnp.int32), jnp.asarray(unexplained, doubted[0].unexplained.dtype)),
+    )
+    change_rad = jnp.full_like(doubted[1].phase_rad, 0.1 * turned)
+    monkeypatch.setattr(FollowedCurvature, "_looked", lambda *_: (estimate, *doubted[1:]))
+    monkeypatch.setattr(SecondLook, "look", lambda *_, **__: Looked(doubted[1], change_rad, turned, 240))
+    sight, state = sensor.measure(exposure, usable, mirror_m, None)
+    assert sight.outcome.succeeded is believed
+    assert (state.sure, state.memory is not None) == (int(believed), believed)
+    assert sight.ffts == int(estimate.ffts) + 240
 
 
 def test_it_closes_from_a_flat_mirror_and_stays_near_the_floor():
