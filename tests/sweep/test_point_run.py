@@ -15,6 +15,12 @@ from nlcwfs.studies.point_run import PointRunner
 from nlcwfs.studies.sweep_points import read_sweep
 
 LEARNS = ["loop.sensor=ideal", "loop.seconds=0.15", "loop.learn_after_s=0.01", "feedback.controller=predictive"]
+SPOTS = [
+    "loop.sensor=shack-hartmann",
+    "shack_hartmann.subapertures=10",
+    "shack_hartmann.pixels=32",
+    "loop.seconds=0.04",
+]
 CURVATURE = ["loop.seconds=0.012"]
 
 
@@ -22,7 +28,7 @@ def told(loop):
     return LoopTelemetry.of(run_loop(loop)[1])
 
 
-@pytest.mark.parametrize("settings", [LEARNS, CURVATURE], ids=["learning", "curvature"])
+@pytest.mark.parametrize("settings", [LEARNS, CURVATURE, SPOTS], ids=["learning", "curvature", "lenslets"])
 def test_a_loop_under_another_seed_is_the_loop_of_that_seed(settings):
     first = Loop.build(small(*settings))
     before = told(first)
