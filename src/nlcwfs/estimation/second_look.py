@@ -83,8 +83,8 @@ class SecondLook(eqx.Module):
     def build(cls, sequence: SequenceReconstructor) -> "SecondLook":
         """Prepare for the frames of one sensor."""
         lit = np.asarray(sequence.solver.level.light) > LIT
-        away, (rows, columns) = scipy.ndimage.distance_transform_edt(~lit, return_indices=True)
-        return cls(sequence, lit, (rows, columns, away <= REACH))
+        away, nearest = scipy.ndimage.distance_transform_edt(~lit, return_indices=True)  # pyright: ignore
+        return cls(sequence, lit, (nearest[0], nearest[1], away <= REACH))
 
     def look(
         self,
@@ -187,5 +187,5 @@ class SecondLook(eqx.Module):
 
 def _around(moved_rad: np.ndarray) -> np.ndarray:
     """1 where the phase was moved and somewhat around, softly 0 beyond."""
-    near = scipy.ndimage.distance_transform_edt(abs(moved_rad) < np.pi) <= AROUND
+    near = np.asarray(scipy.ndimage.distance_transform_edt(abs(moved_rad) < np.pi)) <= AROUND
     return scipy.ndimage.gaussian_filter(near.astype(float), BLUR)

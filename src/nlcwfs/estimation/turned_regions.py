@@ -65,7 +65,7 @@ def turned_regions(
         turns += moved
     parts = []
     for turn in np.unique(turns[lit]):
-        labels, count = scipy.ndimage.label(lit & (turns == turn))
+        labels, count = scipy.ndimage.label(lit & (turns == turn))  # pyright: ignore
         parts += [TurnedRegion(labels == label, int(turn)) for label in range(1, count + 1)]
     parts.sort(key=lambda part: -int(part.cells.sum()))
     still = parts[0].turns

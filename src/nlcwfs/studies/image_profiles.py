@@ -17,7 +17,11 @@ from nlcwfs.studies.sweep_run import RUNS
 PROFILES = "profiles.ecsv"
 """Beside the sweep's table; a column for each run whose image was kept."""
 
-IMAGE = "psf.fits"
+IMAGE, ANGLE = "psf.fits", "angle_arcsec"
+
+
+class Profiles(dict[str, np.ndarray]):
+    """Mean intensity over rings by the name of the run, and the angle of the rings under `ANGLE`."""
 
 
 def ring_means(image: Float[np.ndarray, "v u"]) -> Float[np.ndarray, " ring"]:
@@ -36,7 +40,7 @@ def ring_means(image: Float[np.ndarray, "v u"]) -> Float[np.ndarray, " ring"]:
     return light / np.bincount(ring)[:rings]
 
 
-def keep_profiles(folder: Path, rows: Sequence[Row], stamp: Provenance) -> Table | None:
+def keep_profiles(folder: Path, rows: Sequence[Row], stamp: Provenance) -> Profiles:
     """Take the profiles of the images that were kept into the table, which keeps those that it has.
 
     Args:
@@ -45,34 +49,44 @@ def keep_profiles(folder: Path, rows: Sequence[Row], stamp: Provenance) -> Table
         stamp: Of the table.
 
     Returns:
-        The table, with the angle in arcsec first; None when no image was ever kept.
+        What the table holds; nothing when no image was ever kept.
     """
-    path = folder / PROFILES
-    known = Table.read(path, format="ascii.ecsv") if path.is_file() else Table()
-    found = Table()
+    known, found = read_profiles(folder), Profiles()
     for name in [str(row["point"]) for row in rows]:
         image = folder / RUNS / name / IMAGE
         if image.is_file():
             with fits.open(image) as hdus:
-                profile, step = ring_means(np.asarray(hdus[0].data)), float(hdus[0].header["PIXSCALE"])
-            _add(found, name, profile, step)
-        elif name in known.colnames:
-            _add(found, name, np.asarray(known[name]), float(known["angle_arcsec"][1]))
-    if not found.colnames:
-        return None
-    if found.colnames != known.colnames or any(not np.allclose(found[name], known[name]) for name in found.colnames):
-        found.meta = {"provenance": stamp.as_dict()}
+                hdu = hdus[0]
+                profile = ring_means(np.asarray(hdu.data))  # pyright: ignore
+                _add(found, name, profile, float(hdu.header["PIXSCALE"]))  # pyright: ignore
+        elif name in known:
+            _add(found, name, known[name], float(known[ANGLE][1]))
+    same = found.keys() == known.keys() and all(np.allclose(found[name], known[name]) for name in found)
+    if found and not same:
+        columns = {name: values * u.arcsec if name == ANGLE else values for name, values in found.items()}
         text = io.StringIO()
-        found.write(text, format="ascii.ecsv")
-        with atomic_write(path) as temporary:
+        Table(columns, meta={"provenance": stamp.as_dict()}).write(text, format="ascii.ecsv")
+        with atomic_write(folder / PROFILES) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
     return found
 
 
-def _add(table: Table, name: str, profile: np.ndarray, step_arcsec: float) -> None:
+def read_profiles(folder: Path) -> Profiles:
+    """What the table of a sweep holds; nothing if there is none.
+
+    Args:
+        folder: Of the sweep.
+    """
+    path = folder / PROFILES
+    if not path.is_file():
+        return Profiles()
+    table = Table.read(path, format="ascii.ecsv")
+    return Profiles({name: np.asarray(table[name], float) for name in table.colnames})
+
+
+def _add(profiles: Profiles, name: str, profile: np.ndarray, step_arcsec: float) -> None:
     """A column; images of another scale than the first do not fit beside it and are left out."""
     angle = np.round(np.arange(len(profile)) * step_arcsec, 6)
-    if not table.colnames:
-        table["angle_arcsec"] = angle * u.arcsec
-    if len(angle) == len(table) and np.allclose(angle, table["angle_arcsec"], rtol=1e-3):
-        table[name] = np.array([float(f"{value:.4g}") for value in profile])
+    profiles.setdefault(ANGLE, angle)
+    if len(angle) == len(profiles[ANGLE]) and np.allclose(angle, profiles[ANGLE], rtol=1e-3):
+        profiles[name] = np.array([float(f"{value:.4g}") for value in profile])

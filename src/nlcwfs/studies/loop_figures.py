@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from astropy.table import Table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nlcwfs.studies.image_profiles import PROFILES
+from nlcwfs.studies.image_profiles import ANGLE, read_profiles
 from nlcwfs.studies.study_table import Row
 from nlcwfs.studies.sweep_report import over_seeds
 from nlcwfs.studies.table_axes import column, log_axis
@@ -60,24 +59,22 @@ def draw_images(folder: Path, rows: Sequence[Row]) -> Figure | None:
         folder: Of the sweep; its `profiles.ecsv` is read.
         rows: Of its table.
     """
-    if not (folder / PROFILES).is_file():
-        return None
-    table = Table.read(folder / PROFILES, format="ascii.ecsv")
+    profiles = read_profiles(folder)
     figure = Figure(figsize=(8.2, 4.8), layout="constrained")
     axes = figure.subplots()
     seen: set[str] = set()
     for row in rows:
         case, name = str(row["case"]), str(row["point"])
-        if name not in table.colnames or case in seen:
+        if name not in profiles or case in seen:
             continue
         seen.add(case)
         label = f"{case}: {float(row['rms_nm']):.0f} nm, Strehl {float(row['strehl']):.2f}"
-        axes.semilogy(table["angle_arcsec"], table[name], linewidth=1.3, label=label)
+        axes.semilogy(profiles[ANGLE], profiles[name], linewidth=1.3, label=label)
     if not seen:
         return None
     axes.set_xlabel("angle [arcsec]")
     axes.set_ylabel("mean intensity, peak of a perfect telescope = 1")
-    axes.set_xlim(0, float(table["angle_arcsec"].max()))
+    axes.set_xlim(0, float(profiles[ANGLE].max()))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, frameon=False)
     return figure
