@@ -283,7 +283,12 @@ def test_a_folder_that_becomes_a_file_costs_no_result(tmp_path, monkeypatch):
 def test_a_run_that_is_told_to_end_keeps_what_is_done(tmp_path, monkeypatch, number):
     out = tmp_path / "run"
     before = signal.getsignal(signal.SIGTERM)
-    result = disturbed(monkeypatch, out, lambda: signal.raise_signal(number))
+    # In the background of a shell Python ignores Ctrl-C.
+    as_it_was = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        result = disturbed(monkeypatch, out, lambda: signal.raise_signal(number))
+    finally:
+        signal.signal(signal.SIGINT, as_it_was)
     assert result.exit_code == 130
     assert result.stderr == "nlcwfs: interrupted\n"
     assert f"Kept 10 frames in {out}; --resume goes on." in result.stdout
