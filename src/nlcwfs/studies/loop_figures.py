@@ -39,7 +39,9 @@ def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
         return None
     axes.set_xlabel("exposures a second")
     axes.set_ylabel("residual wavefront [nm rms]")
-    log_axis(axes, (60, 80, 100, 150, 200, 300, 500))
+    low, high = axes.get_ylim()
+    log_axis(axes, [tick for tick in (20, 30, 40, 60, 80, 100, 150, 200, 300, 500, 1000) if low < tick < high])
+    axes.set_ylim(low, high)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, frameon=False, ncols=2)
     return figure
