@@ -105,17 +105,11 @@ def _keep_part(out: Path, config: Config, state: LoopState | None, records: list
 def _write(
     running: Loop, folder: Path, state: LoopState, records: list[Record], made: tuple[dict[str, Any], Provenance]
 ) -> None:
-    """Everything that a run leaves behind; the summary is last, and tells that the rest is there."""
-    from nlcwfs.studies.loop_picture import draw_loop
+    """Everything that a run leaves behind."""
+    from nlcwfs.studies.loop_files import write_run
 
-    numbers, stamp = made
     folder_of.write_checkpoint(folder, running.config, state, records)
-    folder_of.write_records(folder, running, records, stamp)
-    folder_of.write_telemetry(folder, running, state, records, stamp)
-    if int(state.image.exposures):
-        folder_of.write_image(folder, state, stamp)
-    draw_loop(folder / folder_of.PICTURE, running, state, records, floor_nm=numbers["bounds"]["floor_nm"])
-    folder_of.write_summary(folder, numbers, stamp)
+    write_run(folder, running, state, records, *made)
 
 
 def account(numbers: dict) -> list[str]:

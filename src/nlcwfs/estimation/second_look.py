@@ -105,18 +105,18 @@ class SecondLook(eqx.Module):
             known_m: As it was told when the frame was followed.
         """
         seen = counts, usable, read_variance, known_m
-        rough_rad, ffts = self._torn(*seen, memory)
-        regions = self._regions(np.asarray(rough_rad, float))
+        ffts = tearing_ffts(counts.shape[0], TEARING)
+        regions = self._regions(np.asarray(self._torn(*seen, memory), float))
         change_rad, turned = jnp.zeros_like(memory.phase_rad), 0
         if not regions:
-            return Looked(memory, change_rad, turned, int(ffts))
+            return Looked(memory, change_rad, turned, ffts)
         best = self._solved(*seen, memory, change_rad)
         moved_rad = np.zeros(self.lit.shape)
-        ffts = ffts + best[1].ffts
+        ffts += int(best[1].ffts)
         for region in regions:
             tried_rad = moved_rad + self._move_rad(region)
             found = self._solved(*seen, memory, jnp.asarray(tried_rad, change_rad.dtype))
-            ffts = ffts + found[1].ffts
+            ffts += int(found[1].ffts)
             if float(found[1].cost) < float(best[1].cost) - EVIDENCE:
                 best, moved_rad, turned = found, tried_rad, turned + 1
         if turned:
@@ -124,7 +124,7 @@ class SecondLook(eqx.Module):
             around = jnp.asarray(_around(moved_rad), change_rad.dtype)
             change_rad = around * (best[0] - memory.phase_rad)
         after = eqx.tree_at(lambda one: one.phase_rad, memory, memory.phase_rad + change_rad)
-        return Looked(after, change_rad, turned, int(ffts))
+        return Looked(after, change_rad, turned, ffts)
 
     def _regions(self, rough_rad: np.ndarray) -> list[TurnedRegion]:
         """Regions of the rough phase that may be turned, none twice."""
@@ -149,7 +149,7 @@ class SecondLook(eqx.Module):
         measured = solver.capture.measurement(counts, usable, read_variance).padded(solver.level.measured_shape)
         known_rad = solver.known_rad(memory.slope)
         if known_m is not None:
-            known_rad = known_rad + known_m.astype(known_rad.dtype) * (2 * np.pi / solver.geometry.wavelength_m)
+            known_rad = known_rad + self.sequence.phase_of(known_m)
         scale = solver.plane_scale(measured, known_rad + memory.phase_rad)
         prior = solver.prior(solver.power * strength, solver.tilt_rms_rad * jnp.sqrt(strength))
         return solver.task(measured, known_rad, scale, prior, strength)
@@ -157,15 +157,14 @@ class SecondLook(eqx.Module):
     @eqx.filter_jit
     def _torn(
         self, counts: Array, usable: Array, read_variance: Array | float, known_m: Array | None, memory: Memory
-    ) -> tuple[Array, Array]:
-        """The turbulence with what the field shows beside it, torn where that is a turn, and FFTs."""
+    ) -> Float[Array, "Y X"]:
+        """The turbulence with what the field shows beside it, torn where that is a turn."""
         solver = self.sequence.solver
         task = self._task(counts, usable, read_variance, known_m, memory)
         smooth_rad = task.problem.known_rad + memory.phase_rad
         torn_rad = torn_phase(task.level, task.measured, task.scale, smooth_rad, iterations=TEARING, gain=TEARING_GAIN)
         air_rad = memory.phase_rad + tilt_phase(memory.slope, solver.level.grid, solver.geometry.wavelength_m)
-        planes = counts.shape[0]
-        return air_rad + wrap(torn_rad - smooth_rad), jnp.asarray(tearing_ffts(planes, TEARING), jnp.int32)
+        return air_rad + wrap(torn_rad - smooth_rad)
 
     @eqx.filter_jit
     def _solved(

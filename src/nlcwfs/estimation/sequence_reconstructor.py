@@ -147,7 +147,7 @@ class SequenceReconstructor(eqx.Module):
             return solver.account(found), self._begun(found)
         # The tilt of the mirror goes to the tilt of the air, which no periodic window can hold.
         slope = mean_slope(known_m, solver.level.light, grid).astype(solver.power.dtype)
-        rest_rad = self._phase_of(known_m) - tilt_phase(slope, grid, solver.geometry.wavelength_m)
+        rest_rad = self.phase_of(known_m) - tilt_phase(slope, grid, solver.geometry.wavelength_m)
         found = solver.found(near, mirror_rad=-rest_rad)
         memory = self._begun(found)
         return solver.account(found), dataclasses.replace(memory, slope=memory.slope - slope)
@@ -162,7 +162,8 @@ class SequenceReconstructor(eqx.Module):
         parts = self._remembered(task, found.search.best.unknown, found.slope, flat, rms_rad)
         return Memory(*parts, strength, scale, jnp.zeros(len(LAGS), strength.dtype))
 
-    def _phase_of(self, opd_m: Float[Array, "y x"]) -> Float[Array, "y x"]:
+    def phase_of(self, opd_m: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        """Phase of a wavefront at the wavelength of sensing."""
         return opd_m.astype(self.solver.power.dtype) * (2 * np.pi / self.solver.geometry.wavelength_m)
 
     def follow(
@@ -192,7 +193,7 @@ class SequenceReconstructor(eqx.Module):
         measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
         known_rad = solver.known_rad(memory.slope) + expected.phase_rad
         if known_m is not None:
-            known_rad = known_rad + self._phase_of(known_m)
+            known_rad = known_rad + self.phase_of(known_m)
         prior = solver.prior(expected.left_open, expected.tilt_left_rad)
         total = plane_counts(measured)
         scale = PlaneScale(memory.scale.counts * total, memory.scale.background)

@@ -153,7 +153,7 @@ class FollowedCurvature(eqx.Module):
         mirror_m: Float[Array, "lit_y lit_x"],
         memory: FollowedState | None,
     ) -> tuple[Sight, FollowedState]:
-        """What an exposure shows; see `Measurement`."""
+        """What an exposure shows; see `LoopSensor`."""
         state = memory or FollowedState(None, 0, 0, 0)
         counts = exposure.frames.electrons
         if state.memory is None or state.sure < SURE:
@@ -166,8 +166,7 @@ class FollowedCurvature(eqx.Module):
                     outcome = Outcome.BUDGET_SPENT  # healing went astray, but nothing more likely was found
             sure = state.sure + 1 if outcome.succeeded else 0
             after = FollowedState(begun if outcome.succeeded else None, 0, 0, sure)
-            sight = self._sight(estimate, residual_m, outcome, closed=sure >= SURE)._replace(ffts=ffts)
-            return sight, after
+            return self._sight(estimate, residual_m, outcome, ffts, closed=sure >= SURE), after
         seen = counts, usable, mirror_m
         estimate, followed, residual_m = self._looked(SequenceReconstructor.follow, *seen, (state.memory,))
         outcome, ffts = Outcome(int(estimate.outcome_code)), int(estimate.ffts)
@@ -178,12 +177,14 @@ class FollowedCurvature(eqx.Module):
         if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             followed = self.reconstructor.skip(state.memory)
         lost = doubts >= DOUBTS
-        sight = self._sight(estimate, residual_m, outcome, closed=True)._replace(ffts=ffts)
+        sight = self._sight(estimate, residual_m, outcome, ffts, closed=True)
         return sight, FollowedState(None if lost else followed, doubts, since, 0 if lost else state.sure)
 
-    def _sight(self, estimate: WavefrontEstimate, residual_m: Array, outcome: Outcome, *, closed: bool) -> Sight:
+    def _sight(
+        self, estimate: WavefrontEstimate, residual_m: Array, outcome: Outcome, ffts: int, *, closed: bool
+    ) -> Sight:
         part_m = self.cautious.part(residual_m, outcome)
-        return Sight(part_m, outcome, float(estimate.predicted_error_m), int(estimate.ffts), closed)
+        return Sight(part_m, outcome, float(estimate.predicted_error_m), ffts, closed)
 
 
 class SingleFrames(eqx.Module):
@@ -220,7 +221,7 @@ class SingleFrames(eqx.Module):
     def measure(
         self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
     ) -> tuple[Sight, None]:
-        """What an exposure shows; see `Measurement`."""
+        """What an exposure shows; see `LoopSensor`."""
         estimate, residual_m = self._estimated(exposure.frames.electrons, usable)
         outcome = Outcome(int(estimate.outcome_code))
         part_m = self.cautious.part(residual_m, outcome)
@@ -235,7 +236,7 @@ class IdealMeasurement(eqx.Module):
     def measure(
         self, exposure: Exposure, usable: Bool[Array, "plane y x"], mirror_m: Float[Array, "lit_y lit_x"], memory: None
     ) -> tuple[Sight, None]:
-        """What an exposure shows; see `Measurement`."""
+        """What an exposure shows; see `LoopSensor`."""
         margins = [(a - b) // 2 for a, b in zip(exposure.opd_m.shape, mirror_m.shape, strict=True)]
         inner = tuple(slice(m, m + size) for m, size in zip(margins, mirror_m.shape, strict=True))
         residual_m = self.light.mirror.fitted(exposure.opd_m[inner])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from nlcwfs.config import Config, digest, to_toml
+from nlcwfs.config import Config, digest
 from nlcwfs.errors import NlcwfsError
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
@@ -119,15 +119,10 @@ def _kept_files(
     loop: Loop, state: LoopState, records: list[Record], numbers: dict, stamp: Provenance
 ) -> dict[str, bytes]:
     """The files of `nlcwfs loop`, but for the checkpoint; they travel, for a worker may not see the sweep's folder."""
-    from nlcwfs.studies.loop_picture import draw_loop
+    from nlcwfs.studies.loop_files import write_run
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / folder_of.CONFIG).write_text(to_toml(loop.config), encoding="utf-8")
-        folder_of.write_summary(folder, numbers, stamp)
-        folder_of.write_records(folder, loop, records, stamp)
-        folder_of.write_telemetry(folder, loop, state, records, stamp)
-        if int(state.image.exposures):
-            folder_of.write_image(folder, state, stamp)
-        draw_loop(folder / folder_of.PICTURE, loop, state, records, floor_nm=numbers["bounds"]["floor_nm"])
+        folder_of.write_config(folder, loop.config)
+        write_run(folder, loop, state, records, numbers, stamp)
         return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
