@@ -7,7 +7,7 @@ from astropy.table import Table
 
 from nlcwfs.interop import Provenance
 from nlcwfs.studies.image_profiles import PROFILES, keep_profiles, ring_means
-from nlcwfs.studies.loop_figures import draw_images, draw_rates
+from nlcwfs.studies.loop_figures import MAGNITUDE, draw_cases, draw_images, draw_magnitudes, draw_rates
 
 STAMP = Provenance.collect({}, seed=None, device="test")
 
@@ -93,3 +93,31 @@ def test_images_show_one_curve_a_case(tmp_path):
     lines = figure.axes[0].get_lines()
     assert [line.get_ydata()[0] for line in lines] == pytest.approx([0.1, 0.3])
     assert lines[1].get_label() == "b: 120 nm, Strehl 0.70"
+
+
+def test_a_star_is_shown_at_the_rate_that_keeps_most_loops_closed(tmp_path):
+    rows = [
+        row("a", rate, seed, rms, **{MAGNITUDE: 15.0}) for rate, rms in ((100, 150.0), (200, 130.0)) for seed in (0, 1)
+    ]
+    rows += [row("a", 400, 0, 90.0, **{MAGNITUDE: 15.0}), row("a", 400, 1, 90.0, outcome="lost", **{MAGNITUDE: 15.0})]
+    rows += [row("a", 100, 0, 110.0, **{MAGNITUDE: 8.0}), row("dark", 100, 0, 1.0, outcome="lost", **{MAGNITUDE: 18.0})]
+    figure = draw_magnitudes(tmp_path, rows)
+    assert figure is not None
+    (container,) = figure.axes[0].containers
+    assert container.lines[0].get_xdata().tolist() == [8, 15]
+    assert container.lines[0].get_ydata().tolist() == [110, 130]
+    assert draw_magnitudes(tmp_path, rows[-1:]) is None
+    assert draw_magnitudes(tmp_path, [row("a", 100, 0, 80.0)]) is None  # no magnitudes
+
+
+def test_cases_show_every_loop_and_how_many_closed(tmp_path):
+    rows = [row("a", 200, seed, 80.0 + seed) for seed in (0, 1)] + [row("a", 200, 2, 900.0, outcome="lost")]
+    rows += [row("b", 200, 0, np.nan, outcome="not closed")]
+    figure = draw_cases(tmp_path, rows)
+    assert figure is not None
+    closed, lost, floor = figure.axes[0].get_lines()
+    assert closed.get_ydata().tolist() == [80, 81]
+    assert lost.get_ydata().tolist() == [900]
+    assert set(floor.get_ydata()) == {70}
+    labels = [tick.get_text() for tick in figure.axes[0].get_xticklabels()]
+    assert labels == ["a\n2 of 3 closed", "b\n0 of 1 closed"]

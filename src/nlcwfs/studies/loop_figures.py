@@ -12,7 +12,7 @@ from nlcwfs.studies.study_table import Row
 from nlcwfs.studies.sweep_report import over_seeds
 from nlcwfs.studies.table_axes import column, log_axis
 
-RATE = "loop.rate_hz"
+RATE, MAGNITUDE = "loop.rate_hz", "atmosphere.star.magnitude"
 
 LEAST_RATES = 3
 """Fewer are no curve."""
@@ -38,20 +38,103 @@ def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
     if not drawn:
         return None
     axes.set_xlabel("exposures a second")
-    axes.set_ylabel("residual wavefront [nm rms]")
-    low, high = axes.get_ylim()
-    log_axis(axes, [tick for tick in (20, 30, 40, 60, 80, 100, 150, 200, 300, 500, 1000) if low < tick < high])
-    axes.set_ylim(low, high)
-    axes.grid(alpha=0.3)
+    _residual_axis(axes)
     axes.legend(fontsize=8, frameon=False, ncols=2)
     return figure
 
 
-def _curve(axes: Axes, told: Sequence[Row], color: str, label: str) -> None:
-    rate, rms = column(told, RATE), column(told, "rms_nm")
+def draw_magnitudes(folder: Path, rows: Sequence[Row]) -> Figure | None:
+    """Residual against the star's magnitude, a curve for each case, each star at its best rate.
+
+    Args:
+        folder: Of the sweep; nothing is read from it.
+        rows: Of its table.
+    """
+    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
+    axes = figure.subplots()
+    drawn = 0
+    for case in dict.fromkeys(str(row["case"]) for row in rows):
+        stars = at_best_rate([row for row in rows if row["case"] == case])
+        if stars:
+            _curve(axes, stars, f"C{drawn}", case, x=MAGNITUDE)
+            drawn += 1
+    if not drawn:
+        return None
+    axes.set_xlabel("magnitude of the star")
+    _residual_axis(axes)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def at_best_rate(rows: Sequence[Row]) -> list[Row]:
+    """For each magnitude the rate with the most closed loops, and of those the least residual; bright stars first.
+
+    Args:
+        rows: Of one case.
+
+    Examples:
+        >>> loop = {"outcome": "closed", MAGNITUDE: 15.0}
+        >>> rows = [loop | {RATE: 100.0, "rms_nm": 150.0}, loop | {RATE: 200.0, "rms_nm": 130.0}]
+        >>> [(told[RATE], told["rms_nm"]) for told in at_best_rate(rows)]
+        [('200', 130.0)]
+    """
+    stars: dict[float, list[Row]] = {}
+    for told in over_seeds(rows, [MAGNITUDE, RATE]):
+        if told[MAGNITUDE] != "" and int(told["closed"]):
+            stars.setdefault(float(told[MAGNITUDE]), []).append(told)
+    best = {star: min(told, key=lambda one: (-int(one["closed"]), one["rms_nm"])) for star, told in stars.items()}
+    return [best[star] for star in sorted(best)]
+
+
+def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
+    """Residual of every loop, a column for each case; crosses are loops that closed and were open at their end.
+
+    Args:
+        folder: Of the sweep; nothing is read from it.
+        rows: Of its table.
+    """
+    names = list(dict.fromkeys(str(row["case"]) for row in rows))
+    figure = Figure(figsize=(8.2, 4.2), layout="constrained")
+    axes = figure.subplots()
+    ended = [row for row in rows if np.isfinite(float(row.get("rms_nm", np.nan)))]
+    for marker, closed, label in (("o", True, "closed"), ("x", False, "closed and lost")):
+        shown = [row for row in ended if (row["outcome"] == "closed") == closed]
+        x = np.array([names.index(str(row["case"])) for row in shown]) + _side_by_side(shown)
+        axes.plot(x, column(shown, "rms_nm"), marker, color="C0" if closed else "C3", label=label)
+    for place, name in enumerate(names):
+        floors = column([row for row in ended if row["case"] == name], "floor_nm")
+        if len(floors):
+            axes.plot([place - 0.3, place + 0.3], [np.median(floors)] * 2, "--", color="0.4", linewidth=1)
+    axes.set_xticks(range(len(names)), [f"{name}\n{_closed_of(rows, name)}" for name in names])
+    _residual_axis(axes)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _closed_of(rows: Sequence[Row], case: str) -> str:
+    outcomes = [row["outcome"] for row in rows if row["case"] == case]
+    return f"{outcomes.count('closed')} of {len(outcomes)} closed"
+
+
+def _side_by_side(rows: Sequence[Row]) -> np.ndarray:
+    """Where a loop stands in its column, by its seed."""
+    seeds = column(rows, "seed")
+    return 0.08 * (seeds - np.mean(seeds)) if len(seeds) else seeds
+
+
+def _residual_axis(axes: Axes) -> None:
+    axes.set_ylabel("residual wavefront [nm rms]")
+    low, high = axes.get_ylim()
+    log_axis(axes, [tick for tick in (20, 30, 40, 60, 80, 100, 150, 200, 300, 500, 1000, 2000) if low < tick < high])
+    axes.set_ylim(low, high)
+    axes.grid(alpha=0.3)
+
+
+def _curve(axes: Axes, told: Sequence[Row], color: str, label: str, x: str = RATE) -> None:
+    where, rms = column(told, x), column(told, "rms_nm")
     bars = np.stack([rms - column(told, "rms_least_nm"), column(told, "rms_most_nm") - rms])
-    axes.errorbar(rate, rms, yerr=bars, color=color, marker="o", markersize=4, capsize=2, linewidth=1.4, label=label)
-    axes.plot(rate, column(told, "floor_nm"), color=color, linestyle="--", linewidth=0.8)
+    axes.errorbar(where, rms, yerr=bars, color=color, marker="o", markersize=4, capsize=2, linewidth=1.4, label=label)
+    axes.plot(where, column(told, "floor_nm"), color=color, linestyle="--", linewidth=0.8)
 
 
 def draw_images(folder: Path, rows: Sequence[Row]) -> Figure | None:

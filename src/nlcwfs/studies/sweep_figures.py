@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from nlcwfs.errors import FileFormatError
-from nlcwfs.studies.loop_figures import draw_images, draw_rates
+from nlcwfs.studies.loop_figures import draw_cases, draw_images, draw_magnitudes, draw_rates
 from nlcwfs.studies.study_figures import Drawings
 from nlcwfs.studies.study_table import Row
 
@@ -16,6 +16,15 @@ SWEEP_FIGURES: dict[str, tuple[Callable[[Path, Sequence[Row]], Figure | None], s
         draw_rates,
         "What is left against the rate: median and range over the seeds. Dashed, in the same color: the bound of "
         "mirror, lag of one exposure and quantum limit.",
+    ),
+    "magnitudes": (
+        draw_magnitudes,
+        "What is left against the magnitude of the star, each at the best of the rates that were tried: median and "
+        "range over the seeds. Dashed, in the same color: the bound of mirror, lag of one exposure and quantum limit.",
+    ),
+    "cases": (
+        draw_cases,
+        "What is left, a point for each seed. Dashed: the bound of mirror, lag of one exposure and quantum limit.",
     ),
     "images": (
         draw_images,
