@@ -99,12 +99,15 @@ def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
     ended = [row for row in rows if np.isfinite(float(row.get("rms_nm", np.nan)))]
     for marker, closed, label in (("o", True, "closed"), ("x", False, "closed and lost")):
         shown = [row for row in ended if (row["outcome"] == "closed") == closed]
+        if not shown:
+            continue
         x = np.array([names.index(str(row["case"])) for row in shown]) + _side_by_side(shown)
         axes.plot(x, column(shown, "rms_nm"), marker, color="C0" if closed else "C3", label=label)
     for place, name in enumerate(names):
         floors = column([row for row in ended if row["case"] == name], "floor_nm")
         if len(floors):
             axes.plot([place - 0.3, place + 0.3], [np.median(floors)] * 2, "--", color="0.4", linewidth=1)
+    axes.set_xlim(-0.5, len(names) - 0.5)
     axes.set_xticks(range(len(names)), [f"{name}\n{_closed_of(rows, name)}" for name in names])
     _residual_axis(axes)
     axes.legend(fontsize=8, frameon=False)
