@@ -38,6 +38,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs study studies/01-single-frame
 	$(BIN)/nlcwfs study studies/02-every-method
 	$(BIN)/nlcwfs sweep studies/03-closed-loop
+	$(BIN)/nlcwfs sweep studies/04-faint-stars
 	$(BIN)/nlcwfs sweep studies/05-fewer-planes
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
