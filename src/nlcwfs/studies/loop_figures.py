@@ -25,22 +25,12 @@ def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
         folder: Of the sweep; nothing is read from it.
         rows: Of its table.
     """
-    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
-    axes = figure.subplots()
-    drawn = 0
-    for case in dict.fromkeys(str(row["case"]) for row in rows):
-        told = over_seeds([row for row in rows if row["case"] == case], [RATE])
+    curves = {}
+    for case, members in _by_case(rows).items():
+        told = over_seeds(members, [RATE])
         told = sorted((row for row in told if int(row["closed"])), key=lambda row: float(row[RATE]))
-        if len(told) < LEAST_RATES:
-            continue
-        _curve(axes, told, f"C{drawn}", case)
-        drawn += 1
-    if not drawn:
-        return None
-    axes.set_xlabel("exposures a second")
-    _residual_axis(axes)
-    axes.legend(fontsize=8, frameon=False, ncols=2)
-    return figure
+        curves[case] = told if len(told) >= LEAST_RATES else []
+    return _curves(curves, RATE, "exposures a second")
 
 
 def draw_magnitudes(folder: Path, rows: Sequence[Row]) -> Figure | None:
@@ -50,20 +40,8 @@ def draw_magnitudes(folder: Path, rows: Sequence[Row]) -> Figure | None:
         folder: Of the sweep; nothing is read from it.
         rows: Of its table.
     """
-    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
-    axes = figure.subplots()
-    drawn = 0
-    for case in dict.fromkeys(str(row["case"]) for row in rows):
-        stars = at_best_rate([row for row in rows if row["case"] == case])
-        if stars:
-            _curve(axes, stars, f"C{drawn}", case, x=MAGNITUDE)
-            drawn += 1
-    if not drawn:
-        return None
-    axes.set_xlabel("magnitude of the star")
-    _residual_axis(axes)
-    axes.legend(fontsize=8, frameon=False)
-    return figure
+    curves = {case: at_best_rate(members) for case, members in _by_case(rows).items()}
+    return _curves(curves, MAGNITUDE, "magnitude of the star")
 
 
 def at_best_rate(rows: Sequence[Row]) -> list[Row]:
@@ -133,7 +111,27 @@ def _residual_axis(axes: Axes) -> None:
     axes.grid(alpha=0.3)
 
 
-def _curve(axes: Axes, told: Sequence[Row], color: str, label: str, x: str = RATE) -> None:
+def _by_case(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    names = dict.fromkeys(str(row["case"]) for row in rows)
+    return {name: [row for row in rows if row["case"] == name] for name in names}
+
+
+def _curves(curves: dict[str, list[Row]], x: str, label: str) -> Figure | None:
+    """Residual against a setting, a curve for each case that has rows."""
+    shown = {case: told for case, told in curves.items() if told}
+    if not shown:
+        return None
+    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
+    axes = figure.subplots()
+    for number, (case, told) in enumerate(shown.items()):
+        _curve(axes, told, f"C{number}", case, x)
+    axes.set_xlabel(label)
+    _residual_axis(axes)
+    axes.legend(fontsize=8, frameon=False, ncols=2)
+    return figure
+
+
+def _curve(axes: Axes, told: Sequence[Row], color: str, label: str, x: str) -> None:
     where, rms = column(told, x), column(told, "rms_nm")
     bars = np.stack([rms - column(told, "rms_least_nm"), column(told, "rms_most_nm") - rms])
     axes.errorbar(where, rms, yerr=bars, color=color, marker="o", markersize=4, capsize=2, linewidth=1.4, label=label)
