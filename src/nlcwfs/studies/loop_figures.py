@@ -1,4 +1,4 @@
-"""Figures of sweeps of the loop: what is left at each rate, and the star's image."""
+"""Figures of sweeps of the loop: what is left at each rate, of each star, in each case, and the star's image."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,7 +71,8 @@ def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
         folder: Of the sweep; nothing is read from it.
         rows: Of its table.
     """
-    names = list(dict.fromkeys(str(row["case"]) for row in rows))
+    cases = _by_case(rows)
+    names = list(cases)
     figure = Figure(figsize=(8.2, 4.2), layout="constrained")
     axes = figure.subplots()
     ended = [row for row in rows if np.isfinite(float(row.get("rms_nm", np.nan)))]
@@ -86,27 +87,57 @@ def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
         if len(floors):
             axes.plot([place - 0.3, place + 0.3], [np.median(floors)] * 2, "--", color="0.4", linewidth=1)
     axes.set_xlim(-0.5, len(names) - 0.5)
-    axes.set_xticks(range(len(names)), [f"{name}\n{_closed_of(rows, name)}" for name in names])
+    axes.set_xticks(range(len(names)), [f"{name}\n{_closed_of(members)}" for name, members in cases.items()])
     _residual_axis(axes)
     axes.legend(fontsize=8, frameon=False)
     return figure
 
 
-def _closed_of(rows: Sequence[Row], case: str) -> str:
-    outcomes = [row["outcome"] for row in rows if row["case"] == case]
+def draw_images(folder: Path, rows: Sequence[Row]) -> Figure | None:
+    """Mean profiles of the stars' images that were kept, a curve for each case, its first seed.
+
+    Args:
+        folder: Of the sweep; its `profiles.ecsv` is read.
+        rows: Of its table.
+    """
+    profiles = read_profiles(folder)
+    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
+    axes = figure.subplots()
+    seen: set[str] = set()
+    for row in rows:
+        case, name = str(row["case"]), str(row["point"])
+        if name not in profiles or case in seen:
+            continue
+        seen.add(case)
+        label = f"{case}: {float(row['rms_nm']):.0f} nm, Strehl {float(row['strehl']):.2f}"
+        axes.semilogy(profiles[ANGLE], profiles[name], linewidth=1.3, label=label)
+    if not seen:
+        return None
+    axes.set_xlabel("angle [arcsec]")
+    axes.set_ylabel("mean intensity, peak of a perfect telescope = 1")
+    axes.set_xlim(0, float(profiles[ANGLE].max()))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _closed_of(members: Sequence[Row]) -> str:
+    outcomes = [row["outcome"] for row in members]
     return f"{outcomes.count('closed')} of {len(outcomes)} closed"
 
 
 def _side_by_side(rows: Sequence[Row]) -> np.ndarray:
     """Where a loop stands in its column, by its seed."""
     seeds = column(rows, "seed")
-    return 0.08 * (seeds - np.mean(seeds)) if len(seeds) else seeds
+    return 0.08 * (seeds - np.mean(seeds))
 
 
 def _residual_axis(axes: Axes) -> None:
     axes.set_ylabel("residual wavefront [nm rms]")
     low, high = axes.get_ylim()
-    log_axis(axes, [tick for tick in (20, 30, 40, 60, 80, 100, 150, 200, 300, 500, 1000, 2000) if low < tick < high])
+    log_axis(
+        axes, [tick for tick in (20, 30, 40, 60, 80, 100, 120, 150, 200, 300, 500, 1000, 2000) if low < tick < high]
+    )
     axes.set_ylim(low, high)
     axes.grid(alpha=0.3)
 
@@ -136,31 +167,3 @@ def _curve(axes: Axes, told: Sequence[Row], color: str, label: str, x: str) -> N
     bars = np.stack([rms - column(told, "rms_least_nm"), column(told, "rms_most_nm") - rms])
     axes.errorbar(where, rms, yerr=bars, color=color, marker="o", markersize=4, capsize=2, linewidth=1.4, label=label)
     axes.plot(where, column(told, "floor_nm"), color=color, linestyle="--", linewidth=0.8)
-
-
-def draw_images(folder: Path, rows: Sequence[Row]) -> Figure | None:
-    """Mean profiles of the stars' images that were kept, a curve for each case, its first seed.
-
-    Args:
-        folder: Of the sweep; its `profiles.ecsv` is read.
-        rows: Of its table.
-    """
-    profiles = read_profiles(folder)
-    figure = Figure(figsize=(8.2, 4.8), layout="constrained")
-    axes = figure.subplots()
-    seen: set[str] = set()
-    for row in rows:
-        case, name = str(row["case"]), str(row["point"])
-        if name not in profiles or case in seen:
-            continue
-        seen.add(case)
-        label = f"{case}: {float(row['rms_nm']):.0f} nm, Strehl {float(row['strehl']):.2f}"
-        axes.semilogy(profiles[ANGLE], profiles[name], linewidth=1.3, label=label)
-    if not seen:
-        return None
-    axes.set_xlabel("angle [arcsec]")
-    axes.set_ylabel("mean intensity, peak of a perfect telescope = 1")
-    axes.set_xlim(0, float(profiles[ANGLE].max()))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, frameon=False)
-    return figure
