@@ -10,3 +10,6 @@ SEEING_TO_FRIED = 0.976
 
 SEEING_WAVELENGTH_M = 0.5e-6
 """Wavelength at which seeing is quoted, by the field's convention."""
+
+KOLMOGOROV_STRUCTURE = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)
+"""D(r) = 6.88 (r / r0)^(5/3) [rad^2] (Fried 1965; Roddier 1981, Progress in Optics 19, 281)."""

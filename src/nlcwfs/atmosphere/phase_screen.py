@@ -11,7 +11,7 @@ import scipy.integrate
 import scipy.special
 from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
-from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
+from nlcwfs.constants import ARCSEC_RAD, KOLMOGOROV_STRUCTURE, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.errors import SettingsError
 
 SUBHARMONIC_LEVELS = 14
@@ -74,6 +74,22 @@ class Turbulence:
         """Power spectrum of the OPD in m^2 per (cycle/m)^2 (Noll 1976, eq. 21, in OPD)."""
         squared = np.asarray(frequency_per_m) ** 2 + self.outer_scale_m**-2
         return 0.0229 * self.fried_m ** (-5 / 3) * squared ** (-11 / 6) * (self.wavelength_m / (2 * np.pi)) ** 2
+
+    def structure_m2(self, separation_m: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        r"""Structure function of the OPD in m^2: mean square of its difference between two points so far apart.
+
+        :math:`6.88 (r / r_0)^{5/3}` rad^2 for Kolmogorov (Fried 1965); for von Karman as in Conan 2000 (thesis, Nice),
+        :math:`2 \sigma^2 (1 - 2^{1/6} / \Gamma(5/6) \, x^{5/6} K_{5/6}(x))` with :math:`x = 2 \pi r / L_0`.
+        """
+        ratio = (self.wavelength_m / (2 * np.pi)) ** 2 * self.fried_m ** (-5 / 3)
+        if math.isinf(self.outer_scale_m):
+            return ratio * KOLMOGOROV_STRUCTURE * np.abs(separation_m) ** (5 / 3)
+        x = np.maximum(2 * np.pi * np.abs(separation_m) / self.outer_scale_m, 1e-9)
+        shape = 1 - 2 ** (1 / 6) / math.gamma(5 / 6) * x ** (5 / 6) * scipy.special.kv(5 / 6, x)
+        # Both ends meet: near zero the bracket is Gamma(1/6) / Gamma(11/6) (x / 2)^(5/3), in which it has lost digits.
+        slope = math.gamma(1 / 6) / math.gamma(11 / 6) * (x / 2) ** (5 / 3)
+        far = KOLMOGOROV_STRUCTURE * (self.outer_scale_m / np.pi) ** (5 / 3) * math.gamma(11 / 6) / math.gamma(1 / 6)
+        return ratio * far * np.where(x < 1e-3, slope, shape)
 
 
 def mean_rms_m(air: Turbulence, diameter_m: float) -> float:

@@ -11,10 +11,8 @@ from jaxtyping import Array, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modal_pool import Pool, cleaned, orthonormal_pool
 from nlcwfs.beam.pupil import light_weights
+from nlcwfs.constants import KOLMOGOROV_STRUCTURE
 from nlcwfs.errors import SamplingError, SettingsError
-
-KOLMOGOROV_STRUCTURE = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)
-"""D(r) = 6.88 (r / r0)^(5/3) [rad^2] (Fried 1965; Roddier 1981, Progress in Optics 19, 281)."""
 
 KOLMOGOROV_SPECTRUM = 0.0229
 """PSD(f) = 0.0229 r0^(-5/3) f^(-11/3) [rad^2 m^2] (Noll 1976, JOSA 66, 207, eq. 21)."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nlcwfs.estimation.modal_prior import ModalPrior
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase, scaled
 
 BACKTRACKS = 3
@@ -15,10 +16,6 @@ BACKTRACKS = 3
 
 SHORTER = 0.4
 """... each time to this part."""
-
-FILL = 0.15
-"""Share of the window that the pupil fills, for the preconditioner: 0.17 in a window of two telescopes. Too much
-costs a stream of 97 FFTs a frame a tenth of its rms."""
 
 
 class Problem(NamedTuple):
@@ -40,7 +37,7 @@ class Problem(NamedTuple):
     usable: Bool[Array, "plane v u"]
     dark: Float[Array, "plane 1 1"]
     known_rad: Float[Array, "y x"]
-    prior: WhitenedPhase
+    prior: WhitenedPhase | ModalPrior
     information: Float[Array, ""]
     shown: Unknown
 
@@ -115,7 +112,9 @@ def direction_of_step(problem: Problem, inner: int, unknown: Unknown) -> tuple[U
         (seen,) = back(weight * along(prior.phase_rad(v)))
         return plus(prior.transposed(seen), v, 1.0)
 
-    direction = conjugate_gradients(curvature, gradient, preconditioner(problem), prior, inner)
+    direction = conjugate_gradients(
+        curvature, gradient, prior.preconditioner(problem.information, problem.shown), prior, inner
+    )
     return direction, prior.dot(gradient, direction) / 2
 
 
@@ -147,7 +146,7 @@ def conjugate_gradients(
     curvature: Callable[[Unknown], Unknown],
     gradient: Unknown,
     preconditioner: Unknown,
-    prior: WhitenedPhase,
+    prior: WhitenedPhase | ModalPrior,
     count: int,
 ) -> Unknown:
     """So many conjugate gradients towards `curvature^-1 gradient`, from zero, with a diagonal preconditioner.
@@ -181,15 +180,6 @@ def conjugate_gradients(
     first = conditioned(gradient)
     carry = (nothing, gradient, first, prior.dot(gradient, first))
     return jax.lax.scan(one, carry, None, length=count)[0][0]
-
-
-def preconditioner(problem: Problem) -> Unknown:
-    """Inverse of the diagonal of the curvature, `1 / (1 + fill * information * P)` for each wave."""
-    prior, shown = problem.prior, problem.shown
-    waves = 1 / (1 + FILL * problem.information * shown.waves * prior.amplitude**2)
-    lit = jnp.sum(prior.tilt**2, axis=(1, 2))
-    # A tilt reaches beyond the pupil: a disc in a window holds at least an eighth of its squares.
-    return Unknown(waves, 1 / (1 + problem.information * shown.slope * lit / 8))
 
 
 def ffts_per_step(planes: int, inner: int) -> int:

@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.modes import KOLMOGOROV_STRUCTURE, ModalBasis
+from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.constants import KOLMOGOROV_STRUCTURE
 
 
 def modes_beyond_pupil(basis: ModalBasis, grid: Grid, *, diameter_m: float) -> Float[np.ndarray, "mode y x"]:
