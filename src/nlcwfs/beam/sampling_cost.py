@@ -8,9 +8,8 @@ from jaxtyping import Float
 from scipy.special import j1
 
 from nlcwfs.beam.grid import Grid
-from nlcwfs.constants import KOLMOGOROV_STRUCTURE
 from nlcwfs.beam.pupil import circular_pupil
-from nlcwfs.constants import SEEING_TO_FRIED
+from nlcwfs.constants import KOLMOGOROV_STRUCTURE, SEEING_TO_FRIED
 from nlcwfs.errors import SamplingError
 
 

@@ -13,7 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import scipy.ndimage
+from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.beam.modes import ModalBasis
 from nlcwfs.estimation import gauss_newton as gn
@@ -36,13 +37,11 @@ class Followed(NamedTuple):
 
     Attributes:
         modes_rad: Of the air, the mirror's shape not included.
-        model: Counts that are expected.
-        cost: Negative logarithm of the posterior, nats.
+        surprise: Square of what is new, over what is expected of air that was predicted rightly: 1 on average.
     """
 
     modes_rad: Float[Array, " mode"]
-    model: Float[Array, "plane v u"]
-    cost: Float[Array, ""]
+    surprise: Float[Array, ""]
 
 
 class FlowFilter(eqx.Module):
@@ -55,6 +54,8 @@ class FlowFilter(eqx.Module):
         again: From the modes of one frame to those of the next.
         prior: What is new, or was left open.
         modes: On the lit cells.
+        weights: Light of these, sum 1.
+        nearest: The lit cell, by number, whose phase each cell of the grid takes.
         left_rad: Rms error that is left of the modes.
     """
 
@@ -64,6 +65,8 @@ class FlowFilter(eqx.Module):
     again: Float[Array, "mode mode"]
     prior: ModalPrior
     modes: Float[Array, "cell mode"]
+    weights: Float[Array, " cell"]
+    nearest: Int[Array, "y x"]
     left_rad: float = eqx.field(static=True)
 
     @classmethod
@@ -101,13 +104,25 @@ class FlowFilter(eqx.Module):
             again=jnp.asarray(step.again, dtype),
             prior=ModalPrior.build(modes, predicted, information, lit, level.grid.shape, str(dtype)),
             modes=jnp.asarray(modes, dtype),
+            weights=jnp.asarray(np.asarray(basis.weights).ravel()[lit], dtype),
+            nearest=jnp.asarray(_nearest(np.asarray(basis.weights) > 0)),
             left_rad=float(np.sqrt(np.trace(left))),
         )
 
+    @property
+    def ffts(self) -> int:
+        """FFTs of one plane for a frame."""
+        through = self.level.optics.transfer.shape[1] + 1
+        return STEPS * (2 * through + INNER * 2 * through)
+
     def phase_rad(self, modes_rad: Float[Array, " mode"]) -> Float[Array, "y x"]:
-        """The air's phase on the model's grid."""
-        flat = jnp.zeros(self.prior.shape[0] * self.prior.shape[1], self.modes.dtype)
-        return flat.at[self.prior.lit].set(self.modes @ modes_rad).reshape(self.prior.shape)
+        """The air's phase on the model's grid; beyond the light it is that of the nearest lit cell."""
+        return (self.modes @ modes_rad)[self.nearest]
+
+    def modes_of(self, phase_rad: Float[Array, "y x"]) -> Float[Array, " mode"]:
+        """The modes of a phase on the model's grid."""
+        lit_rad = phase_rad.reshape(-1)[self.prior.lit].astype(self.modes.dtype)
+        return (self.weights * lit_rad) @ self.modes
 
     def follow(
         self,
@@ -130,23 +145,26 @@ class FlowFilter(eqx.Module):
         solver, level = self.solver, self.level
         measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
         expected = self.again @ modes_rad
-        total = solver.known_rad(jnp.zeros(2, expected.dtype)) + self.phase_rad(expected)
+        total_rad = solver.known_rad(jnp.zeros(2, expected.dtype)) + self.phase_rad(expected)
         if known_rad is not None:
-            total = total + known_rad
-        scale = self._scale(plane_counts(measured), measured.counts[0].size)
+            total_rad = total_rad + known_rad
+        total = plane_counts(measured)
+        scale = PlaneScale(total, total * self.scattered / measured.counts[0].size)  # the haze of what is uncertain
         one = jnp.ones((), expected.dtype)
-        task = eqx.tree_at(lambda s: s.level, solver, level).task(measured, total, scale, self.prior, one)
+        task = eqx.tree_at(lambda s: s.level, solver, level).task(measured, total_rad, scale, self.prior, one)
         unknown = self.prior.nothing()
         for _ in range(STEPS):
             direction, _ = gn.direction_of_step(task.problem, INNER, unknown)
             unknown = gn.plus(unknown, direction, 1.0)
         found = expected + self.prior.root @ unknown.waves
-        model = task.problem.expected(total + self.prior.phase_rad(unknown))
-        return Followed(found, model, gn.cost(task.problem, unknown))
+        shown = jnp.sum(self.prior.seen / (1 + self.prior.seen))
+        return Followed(found, self.prior.dot(unknown, unknown) / shown)
 
-    def _scale(self, total: Float[Array, "plane 1 1"], pixels: int) -> PlaneScale:
-        """Counts of each plane: the light that interferes, and the haze of what does not."""
-        return PlaneScale(total, total * self.scattered / pixels)
+def _nearest(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
+    """For each cell the number of the lit one that is nearest."""
+    number = np.cumsum(lit).reshape(lit.shape) - 1
+    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
+    return number[row, column]
 
 
 def modal_information(

@@ -10,7 +10,6 @@ from jaxtyping import Array, Complex, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.turbulence_filter import times_counted
 
-
 FILL = 0.15
 """Share of the window that the pupil fills, for the preconditioner: 0.17 in a window of two telescopes. Too much
 costs a stream of 97 FFTs a frame a tenth of its rms."""

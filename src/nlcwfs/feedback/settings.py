@@ -15,10 +15,11 @@ class FeedbackSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    controller: Literal["integrator", "modal-gains", "predictive"] = Field(
+    controller: Literal["integrator", "modal-gains", "predictive", "kalman"] = Field(
         default="integrator",
-        description="the same gain for every mode; a gain for each mode, learnt; or a prediction, learnt. What learns "
-        "is an integrator until it has learnt",
+        description="the same gain for every mode; a gain for each mode, learnt; a prediction of each mode, learnt; or "
+        "Kalman's filter of the air that the wind carries, the wind learnt (curvature sensor with method map). What "
+        "learns is an integrator until it has learnt",
     )
     gain: float = Field(default=1.0, gt=0, le=2, description="share of a measured error that the next command corrects")
     leak: float = Field(

@@ -14,13 +14,15 @@ from nlcwfs.beam.modes import ModalBasis, modal_basis
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.outcome import Outcome
-from nlcwfs.feedback.controller import Controller
+from nlcwfs.feedback.controller import Controller, Telemetry
 from nlcwfs.feedback.state import FeedbackState
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.science.rms_groups import rms_groups
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_faults import bump_rms_m, bump_shape, damaged, fault_in
+from nlcwfs.simulation.loop_flow import carried_curvature
 from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.loop_measurement import FollowedCurvature
 from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor
 from nlcwfs.simulation.loop_sight import Sight
 
@@ -114,13 +116,13 @@ class Loop:
         bump_m = bump_rms_m(settings, state.frame) * self._bump
         corrected = light.expose(jnp.asarray(state.frame, jnp.int32), line, state.image, bump_m)
         arrived = damaged(fault, corrected.exposure, state.before)
-        sight, memory, control = None, state.memory, None
-        if arrived is not None:
+        if arrived is None:
+            sight = None
+            command_m, memory = self.measurement.skip(state.memory)
+        else:
             sight, memory = self._measured(arrived, line.mean_m, state.memory)
-            if sight.outcome not in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
-                control, _ = self.controller.step(state.control, sight.residual_m)
-        if control is None:
-            control, _ = self.controller.skip(state.control)
+            command_m = sight.command_m
+        control = self._commanded(state.control, sight, command_m)
         closed_at = state.closed_at
         if closed_at < 0 and sight is not None and sight.closed:
             closed_at = state.frame
@@ -135,6 +137,26 @@ class Loop:
         )
         before = corrected.exposure if settings.fault == "doubled-frames" else None  # else too large to keep
         return LoopState(state.frame + 1, control, memory, image, closed_at, before), record
+
+    def _commanded(self, control: FeedbackState, sight: Sight | None, command_m: Array | None) -> FeedbackState:
+        """The next command on its way: that of a sensor that looks ahead, or the controller's."""
+        if command_m is not None:
+            return control.push(command_m)
+        if sight is None or sight.outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
+            return self.controller.skip(control)[0]
+        return self.controller.step(control, sight.residual_m)[0]
+
+    def learn(self, telemetry: Telemetry) -> None:
+        """Gains, predictions or the wind, from what was recorded; a loop without a clear wind goes on as it was.
+
+        Args:
+            telemetry: What was recorded since the loop has closed.
+        """
+        if self.config.feedback.controller != "kalman":
+            self.controller = self.controller.learn(telemetry)
+        elif isinstance(self.measurement, FollowedCurvature):
+            filtered = carried_curvature(self.measurement, self.config, self.light, telemetry)
+            self.measurement = filtered or self.measurement
 
     @cached_property
     def _bump(self) -> Float[Array, "lit_y lit_x"]:

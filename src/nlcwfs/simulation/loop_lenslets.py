@@ -126,6 +126,10 @@ class FollowedSpots(eqx.Module):
         sight = Sight(residual_m, Outcome.CONVERGED, state.predicted_m, 0, frames >= 0)
         return sight, after
 
+    def skip(self, memory: SpotsState | None) -> tuple[None, SpotsState | None]:
+        """Spots stay as they are; see `LoopSensor`."""
+        return None, memory
+
     def filter_of(self, spot: Float[Array, "1 v u"], total: float | Float[Array, ""]) -> SpotFilter:
         """The way to a spot's place that the settings ask for.
 

@@ -184,6 +184,12 @@ class FollowedCurvature(eqx.Module):
         sight = self._sight(estimate, residual_m, outcome, ffts, closed=True)
         return sight, FollowedState(None if lost else followed, doubts, since, 0 if lost else state.sure)
 
+    def skip(self, memory: FollowedState | None) -> tuple[None, FollowedState | None]:
+        """An exposure later; see `LoopSensor`."""
+        if memory is None or memory.memory is None:
+            return None, memory
+        return None, memory._replace(memory=self.reconstructor.skip(memory.memory))
+
     def _sight(
         self, estimate: WavefrontEstimate, residual_m: Array, outcome: Outcome, ffts: int, *, closed: bool
     ) -> Sight:
@@ -231,6 +237,10 @@ class SingleFrames(eqx.Module):
         part_m = self.cautious.part(residual_m, outcome)
         return Sight(part_m, outcome, float(estimate.predicted_error_m), int(estimate.ffts), outcome.succeeded), None
 
+    def skip(self, memory: None) -> tuple[None, None]:
+        """Every frame is on its own; see `LoopSensor`."""
+        return None, memory
+
 
 class IdealMeasurement(eqx.Module):
     """Sees the mean residual of an exposure without noise: what lag and the mirror alone leave."""
@@ -245,3 +255,7 @@ class IdealMeasurement(eqx.Module):
         inner = tuple(slice(m, m + size) for m, size in zip(margins, mirror_m.shape, strict=True))
         residual_m = self.light.mirror.fitted(exposure.opd_m[inner])
         return Sight(residual_m, Outcome.CONVERGED, 0.0, 0, True), None
+
+    def skip(self, memory: None) -> tuple[None, None]:
+        """Nothing is remembered; see `LoopSensor`."""
+        return None, memory

@@ -82,12 +82,12 @@ def run_loop(
     settings = loop.config.loop
     state, records = state or loop.init(), records or []
     if records and _has_learnt(loop, state):
-        loop.controller = loop.controller.learn(_closed_part(loop, state, records))
+        loop.learn(_closed_part(loop, state, records))
     while state.frame < settings.frames:
         if state.closed_at < 0 and state.frame >= settings.give_up_s * settings.rate_hz:
             break
         if _learns_at(loop, state) == state.frame:
-            loop.controller = loop.controller.learn(_closed_part(loop, state, records))
+            loop.learn(_closed_part(loop, state, records))
         state, record = loop.step(state)
         records.append(record)
         if watch is not None:

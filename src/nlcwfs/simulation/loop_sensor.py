@@ -5,6 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.config import Config
+from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_lenslet_light import LensletOptics
 from nlcwfs.simulation.loop_lenslets import FollowedSpots
@@ -37,6 +38,17 @@ class LoopSensor(Protocol):
         """
         ...
 
+    def skip(self, memory: Any) -> tuple[Float[Array, " mode"] | None, Any]:
+        """What is to be known after an exposure that did not arrive.
+
+        Args:
+            memory: What the last exposure left.
+
+        Returns:
+            The next command, of a sensor that looks ahead; and the memory.
+        """
+        ...
+
 
 def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     """The sensor and method that a configuration names.
@@ -44,6 +56,10 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     Raises:
         SettingsError: If settings contradict each other.
     """
+    loop, method = config.loop, config.estimation.method
+    if config.feedback.controller == "kalman" and not (loop.sensor == "curvature" and method == "map" and loop.follow):
+        rule = "filters the air of loop.sensor = curvature with estimation.method = map and loop.follow only"
+        raise SettingsError("feedback.controller", rule, "kalman")
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
     if config.loop.sensor == "ideal":

@@ -27,6 +27,8 @@ class Sight(NamedTuple):
         predicted_m: Rms error that it expects of itself.
         ffts: Two-dimensional FFTs of one plane that it took.
         closed: Whether the frame was followed from the one before.
+        command_m: The air of the exposure in which the next command acts, in commands; None from a sensor that does
+            not look ahead.
     """
 
     residual_m: Float[Array, " mode"]
@@ -34,6 +36,7 @@ class Sight(NamedTuple):
     predicted_m: float
     ffts: int
     closed: bool
+    command_m: Float[Array, " mode"] | None = None
 
 
 class PixelModes(eqx.Module):
