@@ -160,6 +160,7 @@ class FlowFilter(eqx.Module):
         shown = jnp.sum(self.prior.seen / (1 + self.prior.seen))
         return Followed(found, self.prior.dot(unknown, unknown) / shown)
 
+
 def _nearest(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
     """For each cell the number of the lit one that is nearest."""
     number = np.cumsum(lit).reshape(lit.shape) - 1

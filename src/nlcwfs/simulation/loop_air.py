@@ -1,4 +1,7 @@
-"""The air of a loop as the wind carries it: what its modes are an exposure later, and what the mirror makes of them."""
+"""The air of a loop as the wind carries it: what its modes are an exposure later, and what the mirror makes of them.
+
+The wind is found in what the loop has recorded. Whatever the sensor, Kalman's filter starts from here.
+"""
 
 from typing import NamedTuple
 
@@ -6,9 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
+from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.config import Config
 from nlcwfs.estimation.moving_modes import DIRECTIONS, Step, carried, displaced_covariance
-from nlcwfs.estimation.wind import Wind
+from nlcwfs.estimation.phase_prior import expected_air
+from nlcwfs.estimation.wind import Wind, found_wind
+from nlcwfs.feedback.controller import Telemetry
 
 UNSTEADY = 0.1
 """Share of its speed by which the wind may blow otherwise than it was found: with none a filter is too sure, and a
@@ -20,7 +27,7 @@ ROUGHNESS_M = 0.3e-9
 WORTH_FITTING = 0.02
 """Combinations of commands that move the modes less than this part of the strongest are left alone."""
 
-ENOUGH = 10
+SLOW = 10
 """Modes that come before say little about the strength of the turbulence: they hardly change in a second."""
 
 
@@ -29,6 +36,7 @@ class MovingAir(NamedTuple):
 
     Attributes:
         basis: The modes.
+        wind: As it was found.
         now_m2: Covariance of one moment.
         step: From exposure to exposure.
         ahead: From the modes of an exposure to those of the one in which its command acts.
@@ -38,6 +46,7 @@ class MovingAir(NamedTuple):
     """
 
     basis: ModalBasis
+    wind: Wind
     now_m2: Float[np.ndarray, "mode mode"]
     step: Step
     ahead: Float[np.ndarray, "mode mode"]
@@ -46,70 +55,100 @@ class MovingAir(NamedTuple):
     beyond_m2: float
 
 
-def moving_air(
+def learnt_air(
+    config: Config,
     basis: ModalBasis,
-    air: Turbulence,
-    wind: Wind,
+    grid: Grid,
     shapes: Float[np.ndarray, "mode command"],
-    *,
-    pixel_m: float,
-    diameter_m: float,
-    interval_s: float,
-    latency_frames: float,
-) -> MovingAir:
-    """What the wind makes of the modes.
+    telemetry: Telemetry,
+) -> MovingAir | None:
+    """The air that a loop has seen; None if no wind is clear.
 
     Args:
+        config: The settings; what they tell of wind and turbulence is not looked for.
         basis: Modes of the pupil.
-        air: Its turbulence.
-        wind: As it was found.
+        grid: Their pixels.
         shapes: Modes of each command.
-        pixel_m: Pixels of the modes.
-        diameter_m: Of the telescope.
-        interval_s: From exposure to exposure.
-        latency_frames: From the end of an exposure to its command.
+        telemetry: What was recorded.
     """
+    modes_m, diameter_m = telemetry.open_loop_m @ shapes.T, config.beam.diameter_m
+    wind = _told_wind(config) or _seen_wind(basis, grid, modes_m, interval_s=1 / config.loop.rate_hz)
+    if wind is None:
+        return None
+    air = _told_air(config) or _seen_air(config, basis, modes_m, commands=shapes.shape[1])
+    moved_m = wind.y_m_per_s / config.loop.rate_hz, wind.x_m_per_s / config.loop.rate_hz
 
     def after(frames: float) -> np.ndarray:
-        moved = wind.y_m_per_s * interval_s * frames, wind.x_m_per_s * interval_s * frames
-        return displaced_covariance(basis, pixel_m, air, [moved])
+        return displaced_covariance(basis, grid.pixel_m, air, [(moved_m[0] * frames, moved_m[1] * frames)])
 
-    now_m2, next_m2 = after(0.0), after(1.0)
-    step = carried(now_m2, next_m2)
-    ahead = step.again if latency_frames == 0 else carried(now_m2, after(1 + latency_frames)).again
-    far_m = float(np.hypot(wind.y_m_per_s, wind.x_m_per_s)) * interval_s
-    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    around = displaced_covariance(
-        basis, pixel_m, air, [(far_m * np.sin(angle), far_m * np.cos(angle)) for angle in angles]
-    )
-    doubt = UNSTEADY**2 * carried(now_m2, (around + around.T) / 2).new + ROUGHNESS_M**2 * np.eye(basis.count)
+    now_m2, late = after(0.0), config.feedback.latency_frames
+    step = carried(now_m2, after(1.0))
+    ahead = step.again if late == 0 else carried(now_m2, after(1 + late)).again
+    step = Step(step.again, step.new + _doubt(basis, grid, air, now_m2, float(np.hypot(*moved_m))))
     left, size, right = np.linalg.svd(shapes, full_matrices=False)
     kept = size > WORTH_FITTING * size[0]
     commands = (right[kept].T / size[kept]) @ left[:, kept].T
     finer = max(basis.kolmogorov_total_rad2 - float(np.sum(basis.kolmogorov_rad2)), 0.0)
-    beyond_m2 = finer * unit_variance_m2(air, diameter_m)
-    return MovingAir(basis, now_m2, Step(step.again, step.new + doubt), ahead, shapes, commands, beyond_m2)
-
-
-def measured_air(
-    basis: ModalBasis, modes_m: Float[np.ndarray, "frame mode"], *, seen: int, diameter_m: float, outer_scale_m: float
-) -> Turbulence:
-    """The turbulence whose modes vary as much as those that were seen.
-
-    Args:
-        basis: The modes.
-        modes_m: Of the air, one row for each exposure.
-        seen: How many of them the mirror makes; the next are not judged.
-        diameter_m: Of the telescope.
-        outer_scale_m: Is not measured.
-    """
-    judged = slice(min(ENOUGH, seen - 1), seen)
-    unit = Turbulence(diameter_m, outer_scale_m=outer_scale_m)  # D / r0 = 1
-    expected_m2 = np.asarray(basis.kolmogorov_rad2)[judged] * unit_variance_m2(unit, diameter_m)
-    strength = float(np.median(np.var(modes_m[:, judged], axis=0) / expected_m2))
-    return Turbulence(diameter_m * strength ** (-3 / 5), outer_scale_m=outer_scale_m)
+    return MovingAir(basis, wind, now_m2, step, ahead, shapes, commands, finer * unit_variance_m2(air, diameter_m))
 
 
 def unit_variance_m2(air: Turbulence, diameter_m: float) -> float:
-    """Variance of the OPD where that of a unit disc of D / r0 = 1 is 1 rad^2."""
+    """Variance in the OPD of what has 1 rad^2 where D / r0 = 1.
+
+    Examples:
+        >>> round(1e9 * unit_variance_m2(Turbulence.from_seeing(seeing_arcsec=0.6), 8.0) ** 0.5)
+        1993
+    """
     return (diameter_m / air.fried_m) ** (5 / 3) * (air.wavelength_m / (2 * np.pi)) ** 2
+
+
+def _doubt(
+    basis: ModalBasis, grid: Grid, air: Turbulence, now_m2: Float[np.ndarray, "mode mode"], moved_m: float
+) -> Float[np.ndarray, "mode mode"]:
+    """Covariance of what is new because neither the wind nor the model is what it is taken for."""
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    moves_m = [(moved_m * float(np.sin(angle)), moved_m * float(np.cos(angle))) for angle in angles]
+    around_m2 = displaced_covariance(basis, grid.pixel_m, air, moves_m)
+    unsteady_m2 = carried(now_m2, (around_m2 + around_m2.T) / 2).new
+    return UNSTEADY**2 * unsteady_m2 + ROUGHNESS_M**2 * np.eye(basis.count)
+
+
+def _told_wind(config: Config) -> Wind | None:
+    """The wind that the settings tell, speed and direction."""
+    prior = config.estimation.prior
+    if prior.wind_direction_deg is None:
+        return None
+    angle, speed = np.deg2rad(prior.wind_direction_deg), prior.wind_speed_m_per_s
+    return Wind(float(speed * np.sin(angle)), float(speed * np.cos(angle)), 1.0)
+
+
+def _seen_wind(
+    basis: ModalBasis, grid: Grid, modes_m: Float[np.ndarray, "frame mode"], *, interval_s: float
+) -> Wind | None:
+    """The wind in the modes of a loop."""
+    lit = np.asarray(basis.weights) > 0
+    rows, columns = (slice(np.flatnonzero(line)[0], np.flatnonzero(line)[-1] + 1) for line in (lit.any(1), lit.any(0)))
+    inner = np.asarray(basis.modes, np.float32)[:, rows, columns]
+    opd_m = np.tensordot(modes_m.astype(np.float32), inner, axes=1)
+    return found_wind(opd_m, lit[rows, columns], pixel_m=grid.pixel_m, interval_s=interval_s)
+
+
+def _told_air(config: Config) -> Turbulence | None:
+    """The turbulence that the settings tell."""
+    settings = config.estimation
+    if settings.seeing_arcsec is None and settings.prior.fried_m is None:
+        return None
+    told = settings.seeing_arcsec or 1.0  # not looked at where Fried's parameter is told
+    return expected_air(settings.prior, seeing_arcsec=told, diameter_m=config.beam.diameter_m)
+
+
+def _seen_air(
+    config: Config, basis: ModalBasis, modes_m: Float[np.ndarray, "frame mode"], *, commands: int
+) -> Turbulence:
+    """The turbulence whose modes vary as much as those that the mirror has followed."""
+    diameter_m, far_m = config.beam.diameter_m, config.estimation.prior.outer_scale_m or np.inf
+    judged = slice(min(SLOW, commands - 1), commands)
+    unit_m2 = unit_variance_m2(Turbulence(diameter_m), diameter_m)
+    expected_m2 = np.asarray(basis.kolmogorov_rad2)[judged] * unit_m2
+    strength = float(np.median(np.var(modes_m[:, judged], axis=0) / expected_m2))
+    return Turbulence(diameter_m * strength ** (-3 / 5), outer_scale_m=far_m)

@@ -8,7 +8,6 @@ linear-quadratic-Gaussian control for a mirror without dynamics (Kulcsar et al. 
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -107,7 +106,7 @@ class CarriedCurvature(eqx.Module):
         flow, noise = self.flow, self.followed.read_variance
         known_rad = self.followed.reconstructor.phase_of(-self.followed.on_model(mirror_m))
         found = flow.follow(counts, usable, modes_rad, read_variance=noise, known_rad=known_rad)
-        if __import__("os").environ.get("DBG"): jax.debug.print("surprise {}", found.surprise)
+            jax.debug.print("surprise {}", found.surprise)
         code = jnp.where(found.surprise < SURPRISING, Outcome.BUDGET_SPENT, Outcome.NOT_EXPLAINED)
         dark = jnp.any(jnp.sum(jnp.where(usable, counts, 0), axis=(1, 2)) <= 0)
         code = jnp.where(dark, Outcome.NO_LIGHT, code)
