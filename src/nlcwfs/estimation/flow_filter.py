@@ -1,10 +1,13 @@
 """Frames of frozen air whose wind is known: Kalman's filter in the modes of the pupil, with a whole covariance.
 
 What the wind carries on is known to a few nanometres, what came in over the rim is not: a covariance that is dense in
-modes tells them apart, which one that is diagonal in waves (`sequence_reconstructor`) cannot. The light is not linear in
-the phase, so each frame takes some Gauss-Newton steps from the prediction (an iterated, extended filter; Bell & Cathey
-1993, IEEE Trans. Autom. Control 38, 294). The covariance depends on the frames only through the information that one
-has, and settles: it is made beforehand.
+modes tells them apart, which one that is diagonal in waves (`sequence_reconstructor`) cannot. The light is not linear
+in the phase, so each frame takes some Gauss-Newton steps from the prediction (an iterated, extended filter; Bell &
+Cathey 1993, IEEE Trans. Autom. Control 38, 294). The covariance depends on the frames only through the information
+that one has, and settles: it is made beforehand.
+
+Not all that a telescope sees moves with the wind. A part of the phase that stays is a state of its own (Friedland 1969,
+IEEE Trans. Autom. Control 14, 359); without it a bump that stays is taken for air, and never corrected.
 """
 
 from typing import NamedTuple
@@ -13,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 import scipy.ndimage
 from jaxtyping import Array, Bool, Float, Int
 
@@ -32,16 +36,33 @@ CHUNK = 20
 """Modes whose light is computed at a time."""
 
 
-class Followed(NamedTuple):
-    """What a frame shows.
+class Flow(NamedTuple):
+    """What is known of the air's phase, mirror not included.
 
     Attributes:
-        modes_rad: Of the air, the mirror's shape not included.
-        surprise: Square of what is new, over what is expected of air that was predicted rightly: 1 on average.
+        moving_rad: Modes of what the wind carries.
+        still_rad: First modes of what stays.
     """
 
-    modes_rad: Float[Array, " mode"]
-    surprise: Float[Array, ""]
+    moving_rad: Float[Array, " mode"]
+    still_rad: Float[Array, " still"]
+
+    @property
+    def whole_rad(self) -> Float[Array, " mode"]:
+        """Both."""
+        return self.moving_rad.at[: self.still_rad.size].add(self.still_rad)
+
+
+class Still(NamedTuple):
+    """What is expected of the part of a phase that stays.
+
+    Attributes:
+        variance: Of each of the first modes, rad^2.
+        kept: Share of it that a frame shows again, just below 1.
+    """
+
+    variance: Float[np.ndarray, " still"]
+    kept: float
 
 
 class FlowFilter(eqx.Module):
@@ -52,6 +73,8 @@ class FlowFilter(eqx.Module):
         level: Its optics; the pupil a little darker, by what the uncertain part of the phase scatters.
         scattered: That light over all, which lies on the frames like a haze.
         again: From the modes of one frame to those of the next.
+        kept: The same of what stays.
+        to_still: What of a change belongs to what stays.
         prior: What is new, or was left open.
         modes: On the lit cells.
         weights: Light of these, sum 1.
@@ -63,6 +86,8 @@ class FlowFilter(eqx.Module):
     level: Level
     scattered: float = eqx.field(static=True)
     again: Float[Array, "mode mode"]
+    kept: float = eqx.field(static=True)
+    to_still: Float[Array, "still mode"]
     prior: ModalPrior
     modes: Float[Array, "cell mode"]
     weights: Float[Array, " cell"]
@@ -75,6 +100,7 @@ class FlowFilter(eqx.Module):
         solver: MaximumAPosteriori,
         basis: ModalBasis,
         step: Step,
+        still: Still,
         information: Float[np.ndarray, "mode mode"],
         *,
         beyond_rad2: float,
@@ -85,15 +111,16 @@ class FlowFilter(eqx.Module):
             solver: The sensor.
             basis: Modes on the model's grid.
             step: Of one interval, rad.
+            still: What does not move.
             information: That a frame has of the modes, 1/rad^2, see `modal_information`.
             beyond_rad2: Variance of the air beyond the modes.
         """
         level, dtype = solver.level, solver.power.dtype
-        lit = np.flatnonzero(np.asarray(basis.weights).ravel() > 0)
+        weights = np.asarray(basis.weights, float)
+        lit = np.flatnonzero(weights > 0)
         modes = np.asarray(basis.modes, float).reshape(basis.count, -1)[:, lit].T
-        predicted = settled_covariance(step, information)
-        left = left_covariance(predicted, information)
-        open_rad2 = np.zeros(basis.weights.size)
+        predicted, to_still = settled_sum(step, still, information)
+        open_rad2 = np.zeros(weights.size)
         open_rad2[lit] = np.einsum("ck,ck->c", modes @ predicted, modes) + beyond_rad2
         modulus = np.asarray(level.modulus, float) * np.exp(-open_rad2.reshape(level.grid.shape) / 2)
         scattered = 1 - np.sum(modulus**2) / np.sum(np.asarray(level.modulus, float) ** 2)
@@ -102,11 +129,13 @@ class FlowFilter(eqx.Module):
             level=eqx.tree_at(lambda one: one.modulus, level, jnp.asarray(modulus, dtype)),
             scattered=float(scattered),
             again=jnp.asarray(step.again, dtype),
+            kept=still.kept,
+            to_still=jnp.asarray(to_still, dtype),
             prior=ModalPrior.build(modes, predicted, information, lit, level.grid.shape, str(dtype)),
             modes=jnp.asarray(modes, dtype),
-            weights=jnp.asarray(np.asarray(basis.weights).ravel()[lit], dtype),
-            nearest=jnp.asarray(_nearest(np.asarray(basis.weights) > 0)),
-            left_rad=float(np.sqrt(np.trace(left))),
+            weights=jnp.asarray(weights.ravel()[lit], dtype),
+            nearest=jnp.asarray(_nearest(weights > 0)),
+            left_rad=float(np.sqrt(np.trace(left_covariance(predicted, information)))),
         )
 
     @property
@@ -115,8 +144,16 @@ class FlowFilter(eqx.Module):
         through = self.level.optics.transfer.shape[1] + 1
         return STEPS * (2 * through + INNER * 2 * through)
 
+    def begun(self, phase_rad: Float[Array, "y x"]) -> Flow:
+        """A phase of which nothing is known to stay."""
+        return Flow(self.modes_of(phase_rad), jnp.zeros(self.to_still.shape[0], self.modes.dtype))
+
+    def skip(self, flow: Flow) -> Flow:
+        """A frame later."""
+        return Flow(self.again @ flow.moving_rad, self.kept * flow.still_rad)
+
     def phase_rad(self, modes_rad: Float[Array, " mode"]) -> Float[Array, "y x"]:
-        """The air's phase on the model's grid; beyond the light it is that of the nearest lit cell."""
+        """The phase on the model's grid; beyond the light it is that of the nearest lit cell."""
         return (self.modes @ modes_rad)[self.nearest]
 
     def modes_of(self, phase_rad: Float[Array, "y x"]) -> Float[Array, " mode"]:
@@ -128,37 +165,67 @@ class FlowFilter(eqx.Module):
         self,
         counts: Float[Array, "plane y x"],
         usable: Bool[Array, "plane y x"],
-        modes_rad: Float[Array, " mode"],
+        flow: Flow,
         *,
         read_variance: float | Float[Array, ""] = 0.0,
         known_rad: Float[Array, "Y X"] | None = None,
-    ) -> Followed:
+    ) -> tuple[Flow, Float[Array, ""]]:
         """The air behind the next frame.
 
         Args:
             counts: Photo-electrons on the frames' pixels, background subtracted.
             usable: False for pixels to ignore.
-            modes_rad: What the last frame showed.
+            flow: What the last frame showed.
             read_variance: Variance of a pixel without light, electrons squared.
             known_rad: Phase on the model's grid beside the air's: minus the shape of a mirror.
+
+        Returns:
+            What this one shows; and the surprise, the square of what is new over what is expected of it when the
+            prediction is right: about 1 or less.
         """
         solver, level = self.solver, self.level
         measured = solver.capture.measurement(counts, usable, read_variance).padded(level.measured_shape)
-        expected = self.again @ modes_rad
-        total_rad = solver.known_rad(jnp.zeros(2, expected.dtype)) + self.phase_rad(expected)
+        expected = self.skip(flow)
+        total_rad = solver.known_rad(jnp.zeros(2, self.modes.dtype)) + self.phase_rad(expected.whole_rad)
         if known_rad is not None:
             total_rad = total_rad + known_rad
         total = plane_counts(measured)
         scale = PlaneScale(total, total * self.scattered / measured.counts[0].size)  # the haze of what is uncertain
-        one = jnp.ones((), expected.dtype)
+        one = jnp.ones((), self.modes.dtype)
         task = eqx.tree_at(lambda s: s.level, solver, level).task(measured, total_rad, scale, self.prior, one)
         unknown = self.prior.nothing()
         for _ in range(STEPS):
             direction, _ = gn.direction_of_step(task.problem, INNER, unknown)
             unknown = gn.plus(unknown, direction, 1.0)
-        found = expected + self.prior.root @ unknown.waves
+        change_rad = self.prior.root @ unknown.waves
+        still_rad = self.to_still @ change_rad
+        moving_rad = (expected.moving_rad + change_rad).at[: still_rad.size].add(-still_rad)
         shown = jnp.sum(self.prior.seen / (1 + self.prior.seen))
-        return Followed(found, self.prior.dot(unknown, unknown) / shown)
+        return Flow(moving_rad, expected.still_rad + still_rad), self.prior.dot(unknown, unknown) / shown
+
+
+def settled_sum(
+    step: Step, still: Still, information: Float[np.ndarray, "mode mode"]
+) -> tuple[Float[np.ndarray, "mode mode"], Float[np.ndarray, "still mode"]]:
+    r"""Covariance of the predicted sum of what moves and what stays, and the share of a change that stays.
+
+    Light shows only the sum y = T z of the state z. With P the settled covariance of z, the sum has
+    :math:`T P T^T`, and a change d of y is one of z by :math:`P T^T (T P T^T)^{-1} d`.
+
+    Examples:
+        >>> step, still = Step(np.array([[0.5]]), np.array([[1.0]])), Still(np.array([1.0]), 1 - 1e-9)
+        >>> covariance, to_still = settled_sum(step, still, np.array([[1.0]]))
+        >>> bool(to_still[0, 0] < 0.01), bool(covariance[0, 0] < 1.2)  # what stays is known after many frames
+        (True, True)
+    """
+    count, few = len(step.again), len(still.variance)
+    both = np.hstack([np.eye(count), np.eye(count, few)])
+    again = scipy.linalg.block_diag(step.again, still.kept * np.eye(few))
+    new = scipy.linalg.block_diag(step.new, np.diag(still.variance * (1 - still.kept**2)))
+    settled = settled_covariance(Step(again, new), both.T @ information @ both)
+    predicted = both @ settled @ both.T
+    to_still = scipy.linalg.solve(predicted, both @ settled[:, count:], assume_a="pos").T
+    return (predicted + predicted.T) / 2, to_still
 
 
 def _nearest(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:

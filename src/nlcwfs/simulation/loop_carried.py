@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nlcwfs.estimation.flow_filter import FlowFilter
+from nlcwfs.estimation.flow_filter import Flow, FlowFilter
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
@@ -22,24 +22,37 @@ from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_measurement import DOUBTS, SURE, FollowedCurvature, FollowedState
 from nlcwfs.simulation.loop_sight import Sight
 
-SURPRISING = 4.0
-"""An exposure whose news are so many times what is expected is not believed."""
+SURPRISING = 2.0
+"""An exposure is not believed whose news are so many times the usual: a bump of 300 nm brings three times as much, a
+calm loop varies by a tenth."""
+
+CALM_FRAMES = 20
+"""Exposures over which the usual is averaged."""
+
+REST_FRAMES = 50
+"""Exposures that are followed without wind after the filter was lost, each time twice as many."""
 
 
 class CarriedState(NamedTuple):
     """Memory of a loop whose air is carried.
 
     Attributes:
-        modes_rad: The air of the last exposure.
-        last: What was remembered when its wind was found; a second look needs it.
-        doubts: Frames in a row that were not explained.
-        since: Frames since the last second look.
+        followed: What a loop without wind remembers; while the air is carried, as it was when that began.
+        flow: The air of the last exposure; None while it is not carried.
+        calm: Usual surprise.
+        doubts: Exposures in a row that were not believed.
+        since: Exposures since the last second look.
+        rest: Exposures until the air is carried again ...
+        pause: ... and how many it will be the next time.
     """
 
-    modes_rad: Float[Array, " mode"]
-    last: Memory
-    doubts: int
-    since: int
+    followed: FollowedState | None
+    flow: Flow | None = None
+    calm: float = 1.0
+    doubts: int = 0
+    since: int = 0
+    rest: int = 0
+    pause: int = REST_FRAMES
 
 
 class CarriedCurvature(eqx.Module):
@@ -47,7 +60,7 @@ class CarriedCurvature(eqx.Module):
 
     Attributes:
         followed: Captures the wavefront, and knows the mirror's shape on the cells of the model.
-        flow: The filter.
+        filter: The filter.
         seen: Commands that make the mirror the air of an exposure.
         ahead: ... of the exposure in which the next command acts.
         mirror: Whose commands they are.
@@ -55,7 +68,7 @@ class CarriedCurvature(eqx.Module):
     """
 
     followed: FollowedCurvature
-    flow: FlowFilter
+    filter: FlowFilter
     seen: Float[Array, "command mode"]
     ahead: Float[Array, "command mode"]
     mirror: Mirror
@@ -67,81 +80,99 @@ class CarriedCurvature(eqx.Module):
         usable: Bool[Array, "plane y x"],
         mirror_m: Float[Array, "lit_y lit_x"],
         memory: FollowedState | CarriedState | None,
-    ) -> tuple[Sight, FollowedState | CarriedState]:
+    ) -> tuple[Sight, CarriedState]:
         """What an exposure shows; see `LoopSensor`."""
-        if isinstance(memory, FollowedState) and memory.memory is not None and memory.sure >= SURE:
-            memory = CarriedState(self._modes_of(memory.memory), memory.memory, 0, memory.since)
-        if not isinstance(memory, CarriedState):
-            return self.followed.measure(exposure, usable, mirror_m, memory)
-        counts = exposure.frames.electrons
-        found, code = self._carried(counts, usable, mirror_m, memory.modes_rad)
-        outcome, ffts = Outcome(int(code)), self.flow.ffts
-        doubts, since = 0 if outcome.succeeded else memory.doubts + 1, memory.since + 1
-        if outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
-            found = self.flow.again @ memory.modes_rad
-        elif outcome.succeeded and self.followed.look_again_every and since >= self.followed.look_again_every:
-            found, more = self._looked_again(counts, usable, mirror_m, found, memory.last)
-            ffts, since = ffts + more, 0
-        sight = self._sight(found, mirror_m, outcome, ffts)
-        if doubts >= DOUBTS:
-            return sight, FollowedState(None, 0, 0, 0)
-        return sight, CarriedState(found, memory.last, doubts, since)
+        state = memory if isinstance(memory, CarriedState) else self._begun(CarriedState(memory))
+        if state.flow is not None:
+            return self._carried(exposure.frames.electrons, usable, mirror_m, state, state.flow)
+        sight, followed = self.followed.measure(exposure, usable, mirror_m, state.followed)
+        return sight, self._begun(state._replace(followed=followed, rest=max(0, state.rest - 1)))
 
     def skip(self, memory: Any) -> tuple[Float[Array, " command"] | None, Any]:
         """The wind goes on without an exposure; see `LoopSensor`."""
         if not isinstance(memory, CarriedState):
             return self.followed.skip(memory)
-        modes_rad = self.flow.again @ memory.modes_rad
-        return self.ahead @ modes_rad * self._radian_m, memory._replace(modes_rad=modes_rad)
+        if memory.flow is None:
+            command_m, followed = self.followed.skip(memory.followed)
+            return command_m, memory._replace(followed=followed)
+        flow = self.filter.skip(memory.flow)
+        return self._command_m(flow), memory._replace(flow=flow)
+
+    def _begun(self, state: CarriedState) -> CarriedState:
+        """The air is carried from what is followed, if that is sure."""
+        followed = state.followed
+        if state.rest or followed is None or followed.memory is None or followed.sure < SURE:
+            return state
+        return state._replace(flow=self._flow_of(followed.memory), calm=1.0, doubts=0, since=followed.since)
+
+    def _carried(
+        self, counts: Array, usable: Array, mirror_m: Array, state: CarriedState, before: Flow
+    ) -> tuple[Sight, CarriedState]:
+        """An exposure of air that is carried."""
+        flow, code, surprise = self._followed(counts, usable, mirror_m, before, jnp.asarray(state.calm))
+        outcome, ffts, every = Outcome(int(code)), self.filter.ffts, self.followed.look_again_every
+        doubts, since, calm = state.doubts + 1, state.since + 1, state.calm
+        if outcome.succeeded:
+            doubts, calm = 0, calm + (float(surprise) - calm) / CALM_FRAMES
+            if every and since >= every and state.followed is not None and state.followed.memory is not None:
+                flow, more = self._looked_again(counts, usable, mirror_m, flow, state.followed.memory)
+                ffts, since = ffts + more, 0
+        command_m = self._command_m(flow)
+        residual_m = self.seen @ flow.whole_rad * self._radian_m - self.mirror.fitted(mirror_m)
+        sight = Sight(residual_m, outcome, self.filter.left_rad * self._radian_m, ffts, True, command_m)
+        if doubts >= DOUBTS:
+            return sight, CarriedState(None, rest=state.pause, pause=2 * state.pause)
+        return sight, state._replace(flow=flow, calm=calm, doubts=doubts, since=since)
 
     @property
     def _radian_m(self) -> float:
-        return self.flow.solver.geometry.wavelength_m / (2 * np.pi)
+        return self.filter.solver.geometry.wavelength_m / (2 * np.pi)
 
     @eqx.filter_jit
-    def _carried(
-        self, counts: Array, usable: Array, mirror_m: Array, modes_rad: Array
-    ) -> tuple[Float[Array, " mode"], Int[Array, ""]]:
-        """The air of an exposure, and how it ended."""
-        flow, noise = self.flow, self.followed.read_variance
+    def _followed(
+        self, counts: Array, usable: Array, mirror_m: Array, before: Flow, calm: Float[Array, ""]
+    ) -> tuple[Flow, Int[Array, ""], Float[Array, ""]]:
+        """The air of an exposure, how it ended, and its surprise."""
         known_rad = self.followed.reconstructor.phase_of(-self.followed.on_model(mirror_m))
-        found = flow.follow(counts, usable, modes_rad, read_variance=noise, known_rad=known_rad)
-            jax.debug.print("surprise {}", found.surprise)
-        code = jnp.where(found.surprise < SURPRISING, Outcome.BUDGET_SPENT, Outcome.NOT_EXPLAINED)
+        noise = self.followed.read_variance
+        flow, surprise = self.filter.follow(counts, usable, before, read_variance=noise, known_rad=known_rad)
+        code = jnp.where(surprise < SURPRISING * calm, Outcome.BUDGET_SPENT, Outcome.NOT_EXPLAINED)
         dark = jnp.any(jnp.sum(jnp.where(usable, counts, 0), axis=(1, 2)) <= 0)
         code = jnp.where(dark, Outcome.NO_LIGHT, code)
-        code = jnp.where(jnp.all(jnp.isfinite(found.modes_rad)), code, Outcome.NOT_FINITE)
-        return found.modes_rad, code.astype(jnp.int32)
-
-    def _looked_again(
-        self, counts: Array, usable: Array, mirror_m: Array, modes_rad: Array, last: Memory
-    ) -> tuple[Float[Array, " mode"], int]:
-        """The modes without the islands that a second look brings back, and its FFTs."""
-        followed = self.followed
-        known_m, noise = -followed.on_model(mirror_m), followed.read_variance
-        memory = self._memory_of(modes_rad, last)
-        looked = followed.second.look(counts, usable, memory, read_variance=noise, known_m=known_m)
-        if looked.turned:
-            modes_rad = modes_rad + self.flow.modes_of(looked.change_rad)
-        return modes_rad, looked.ffts
+        finite = jnp.all(jnp.isfinite(flow.moving_rad))
+        code = jnp.where(finite, code, Outcome.NOT_FINITE).astype(jnp.int32)
+        gone: Flow = self.filter.skip(before)
+        kept = Flow(*(jnp.where(dark | ~finite, old, new) for old, new in zip(gone, flow, strict=True)))
+        return kept, code, surprise
 
     @eqx.filter_jit
-    def _memory_of(self, modes_rad: Array, last: Memory) -> Memory:
-        """The modes as waves and a tilt."""
-        solver, phase_rad = self.flow.solver, self.flow.phase_rad(modes_rad)
+    def _command_m(self, flow: Flow) -> Float[Array, " command"]:
+        """The air of the exposure in which the next command acts."""
+        still = self.seen[:, : flow.still_rad.size] @ flow.still_rad
+        return (self.ahead @ flow.moving_rad + still) * self._radian_m
+
+    def _looked_again(
+        self, counts: Array, usable: Array, mirror_m: Array, flow: Flow, last: Memory
+    ) -> tuple[Flow, int]:
+        """The air without the islands that a second look brings back, and its FFTs."""
+        known_m, noise = -self.followed.on_model(mirror_m), self.followed.read_variance
+        memory = self._memory_of(flow, last)
+        looked = self.followed.second.look(counts, usable, memory, read_variance=noise, known_m=known_m)
+        if looked.turned:
+            flow = flow._replace(moving_rad=flow.moving_rad + self.filter.modes_of(looked.change_rad))
+        return flow, looked.ffts
+
+    @eqx.filter_jit
+    def _memory_of(self, flow: Flow, last: Memory) -> Memory:
+        """The air as waves and a tilt."""
+        solver, phase_rad = self.filter.solver, self.filter.phase_rad(flow.whole_rad)
         slope = mean_slope(phase_rad, solver.level.light, solver.level.grid) * self._radian_m
         rest_rad = phase_rad - tilt_phase(slope, solver.level.grid, solver.geometry.wavelength_m)
         return eqx.tree_at(lambda one: (one.phase_rad, one.slope), last, (rest_rad, slope))
 
-    def _modes_of(self, memory: Memory) -> Float[Array, " mode"]:
-        """The modes of waves and a tilt."""
-        solver = self.flow.solver
+    @eqx.filter_jit
+    def _flow_of(self, memory: Memory) -> Flow:
+        """The air of waves and a tilt."""
+        solver = self.filter.solver
         tilt_rad = tilt_phase(memory.slope, solver.level.grid, solver.geometry.wavelength_m)
-        return self.flow.modes_of(memory.phase_rad + tilt_rad)
-
-    def _sight(
-        self, modes_rad: Float[Array, " mode"], mirror_m: Float[Array, "lit_y lit_x"], outcome: Outcome, ffts: int
-    ) -> Sight:
-        residual_m = self.seen @ modes_rad * self._radian_m - self.mirror.fitted(mirror_m)
-        command_m = self.ahead @ modes_rad * self._radian_m
-        return Sight(residual_m, outcome, self.flow.left_rad * self._radian_m, ffts, True, command_m)
+        return self.filter.begun(memory.phase_rad + tilt_rad)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from nlcwfs.beam.modes import DIM, ModalBasis, modal_basis
 from nlcwfs.config import Config
-from nlcwfs.estimation.flow_filter import FlowFilter, modal_information
+from nlcwfs.estimation.flow_filter import FlowFilter, Still, modal_information
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.moving_modes import Step
 from nlcwfs.estimation.resolution_level import Measurement
@@ -26,6 +26,9 @@ AT_LEAST = 500
 
 CELLS = 4
 """Lit cells for each mode, at least."""
+
+STILL_M, STILL_S, STILL_MODES = 50e-9, 2.0, 200
+"""What a telescope shows that does not move with the wind: rms, how long it lasts, and in how many modes."""
 
 DRAW = 20101
 """Seed of the air beyond the mirror's modes at which the light is linearised."""
@@ -48,12 +51,12 @@ def carried_curvature(
     if air is None:
         return None
     residual_m = air.shapes @ np.asarray(telemetry.measured_m[-1], float)
-    flow = settled_filter(solver, air, residual_m, photons=light.still.photons)
+    made = settled_filter(solver, air, residual_m, photons=light.still.photons, interval_s=1 / config.loop.rate_hz)
     return CarriedCurvature(
         followed=followed,
-        flow=flow,
-        seen=jnp.asarray(air.commands, flow.modes.dtype),
-        ahead=jnp.asarray(air.commands @ air.ahead, flow.modes.dtype),
+        filter=made,
+        seen=jnp.asarray(air.commands, made.modes.dtype),
+        ahead=jnp.asarray(air.commands @ air.ahead, made.modes.dtype),
         mirror=light.mirror,
         wind=air.wind,
     )
@@ -86,7 +89,12 @@ def mirror_modes(followed: FollowedCurvature, light: LoopLight, basis: ModalBasi
 
 
 def settled_filter(
-    solver: MaximumAPosteriori, air: MovingAir, residual_m: Float[np.ndarray, " mode"], *, photons: float
+    solver: MaximumAPosteriori,
+    air: MovingAir,
+    residual_m: Float[np.ndarray, " mode"],
+    *,
+    photons: float,
+    interval_s: float,
 ) -> FlowFilter:
     """Kalman's filter for a wind.
 
@@ -95,13 +103,21 @@ def settled_filter(
         air: Its modes.
         residual_m: What the mirror leaves of it, in the modes; finer air is drawn.
         photons: Of an exposure.
+        interval_s: From exposure to exposure.
     """
     radian_m = solver.geometry.wavelength_m / (2 * np.pi)
     drawn_m = np.linalg.cholesky(air.now_m2) @ np.random.default_rng(DRAW).standard_normal(air.basis.count)
     finer_m = drawn_m - air.shapes @ (air.commands @ drawn_m)
     step = Step(air.step.again, air.step.new / radian_m**2)
     seen = seen_information(solver, air.basis, (residual_m + finer_m) / radian_m, photons=photons)
-    return FlowFilter.build(solver, air.basis, step, seen, beyond_rad2=air.beyond_m2 / radian_m**2)
+    still = Still(expected_still(air) / radian_m**2, float(np.exp(-interval_s / STILL_S)))
+    return FlowFilter.build(solver, air.basis, step, still, seen, beyond_rad2=air.beyond_m2 / radian_m**2)
+
+
+def expected_still(air: MovingAir) -> Float[np.ndarray, " still"]:
+    """Variance in m^2 of the modes that stay: as of turbulence, with a rms of `STILL_M` in all."""
+    shape = np.asarray(air.basis.kolmogorov_rad2)[: min(STILL_MODES, air.shapes.shape[1])]
+    return STILL_M**2 * shape / np.sum(shape)
 
 
 def seen_information(
