@@ -146,6 +146,13 @@ class Loop:
             return self.controller.skip(control)[0]
         return self.controller.step(control, sight.residual_m)[0]
 
+    @property
+    def learns(self) -> bool:
+        """Whether there is anything to learn: a wind that is told is not."""
+        kind = self.config.feedback.controller
+        told = kind == "kalman" and self.config.estimation.prior.wind_direction_deg is not None
+        return kind != "integrator" and not told
+
     def learn(self, telemetry: Telemetry) -> None:
         """Gains, predictions or the wind, from what was recorded; a loop without a clear wind goes on as it was.
 

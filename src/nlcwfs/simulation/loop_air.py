@@ -12,6 +12,7 @@ from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis
 from nlcwfs.config import Config
+from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.moving_modes import DIRECTIONS, Step, carried, displaced_covariance
 from nlcwfs.estimation.phase_prior import expected_air
 from nlcwfs.estimation.wind import Wind, found_wind
@@ -36,6 +37,7 @@ class MovingAir(NamedTuple):
 
     Attributes:
         basis: The modes.
+        turbulence: Told, or as strong as the modes show.
         wind: As it was found.
         now_m2: Covariance of one moment.
         step: From exposure to exposure.
@@ -46,6 +48,7 @@ class MovingAir(NamedTuple):
     """
 
     basis: ModalBasis
+    turbulence: Turbulence
     wind: Wind
     now_m2: Float[np.ndarray, "mode mode"]
     step: Step
@@ -60,7 +63,7 @@ def learnt_air(
     basis: ModalBasis,
     grid: Grid,
     shapes: Float[np.ndarray, "mode command"],
-    telemetry: Telemetry,
+    telemetry: Telemetry | None,
 ) -> MovingAir | None:
     """The air that a loop has seen; None if no wind is clear.
 
@@ -69,9 +72,17 @@ def learnt_air(
         basis: Modes of the pupil.
         grid: Their pixels.
         shapes: Modes of each command.
-        telemetry: What was recorded.
+        telemetry: What was recorded; None where wind and turbulence are told.
+
+    Raises:
+        SettingsError: If nothing was recorded, and something is not told.
     """
-    modes_m, diameter_m = telemetry.open_loop_m @ shapes.T, config.beam.diameter_m
+    modes_m, diameter_m = np.zeros((0, basis.count)), config.beam.diameter_m
+    if telemetry is not None:
+        modes_m = telemetry.open_loop_m @ shapes.T
+    elif _told_air(config) is None:
+        rule = "must be told (or fried_m) with estimation.prior.wind_direction_deg and feedback.controller = kalman"
+        raise SettingsError("estimation.seeing_arcsec", rule, None)
     wind = _told_wind(config) or _seen_wind(basis, grid, modes_m, interval_s=1 / config.loop.rate_hz)
     if wind is None:
         return None
@@ -89,7 +100,7 @@ def learnt_air(
     kept = size > WORTH_FITTING * size[0]
     commands = (right[kept].T / size[kept]) @ left[:, kept].T
     finer = max(basis.kolmogorov_total_rad2 - float(np.sum(basis.kolmogorov_rad2)), 0.0)
-    return MovingAir(basis, wind, now_m2, step, ahead, shapes, commands, finer * unit_variance_m2(air, diameter_m))
+    return MovingAir(basis, air, wind, now_m2, step, ahead, shapes, commands, finer * unit_variance_m2(air, diameter_m))
 
 
 def unit_variance_m2(air: Turbulence, diameter_m: float) -> float:

@@ -14,8 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.estimation.flow_filter import Flow, FlowFilter
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
+from nlcwfs.estimation.wave_sensitivity import LAGS
 from nlcwfs.estimation.wind import Wind
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.simulation.exposure import Exposure
@@ -37,7 +39,7 @@ class CarriedState(NamedTuple):
     """Memory of a loop whose air is carried.
 
     Attributes:
-        followed: What a loop without wind remembers; while the air is carried, as it was when that began.
+        followed: What a loop without wind remembers.
         flow: The air of the last exposure; None while it is not carried.
         calm: Usual surprise.
         doubts: Exposures in a row that were not believed.
@@ -65,6 +67,8 @@ class CarriedCurvature(eqx.Module):
         ahead: ... of the exposure in which the next command acts.
         mirror: Whose commands they are.
         wind: As it was found.
+        strength: Variance of the turbulence over that which its prior has.
+        starts_closed: Whether the mirror has the shape of the air before the first exposure.
     """
 
     followed: FollowedCurvature
@@ -73,6 +77,8 @@ class CarriedCurvature(eqx.Module):
     ahead: Float[Array, "command mode"]
     mirror: Mirror
     wind: Wind = eqx.field(static=True)
+    strength: float = eqx.field(static=True)
+    starts_closed: bool = eqx.field(static=True)
 
     def measure(
         self,
@@ -83,6 +89,8 @@ class CarriedCurvature(eqx.Module):
     ) -> tuple[Sight, CarriedState]:
         """What an exposure shows; see `LoopSensor`."""
         state = memory if isinstance(memory, CarriedState) else self._begun(CarriedState(memory))
+        if memory is None and self.starts_closed:
+            state = state._replace(flow=self._flow_of_mirror(mirror_m))
         if state.flow is not None:
             return self._carried(exposure.frames.electrons, usable, mirror_m, state, state.flow)
         sight, followed = self.followed.measure(exposure, usable, mirror_m, state.followed)
@@ -114,8 +122,8 @@ class CarriedCurvature(eqx.Module):
         doubts, since, calm = state.doubts + 1, state.since + 1, state.calm
         if outcome.succeeded:
             doubts, calm = 0, calm + (float(surprise) - calm) / CALM_FRAMES
-            if every and since >= every and state.followed is not None and state.followed.memory is not None:
-                flow, more = self._looked_again(counts, usable, mirror_m, flow, state.followed.memory)
+            if every and since >= every:
+                flow, more = self._looked_again(counts, usable, mirror_m, flow)
                 ffts, since = ffts + more, 0
         command_m = self._command_m(flow)
         residual_m = self.seen @ flow.whole_rad * self._radian_m - self.mirror.fitted(mirror_m)
@@ -151,24 +159,35 @@ class CarriedCurvature(eqx.Module):
         still = self.seen[:, : flow.still_rad.size] @ flow.still_rad
         return (self.ahead @ flow.moving_rad + still) * self._radian_m
 
-    def _looked_again(
-        self, counts: Array, usable: Array, mirror_m: Array, flow: Flow, last: Memory
-    ) -> tuple[Flow, int]:
+    def _looked_again(self, counts: Array, usable: Array, mirror_m: Array, flow: Flow) -> tuple[Flow, int]:
         """The air without the islands that a second look brings back, and its FFTs."""
         known_m, noise = -self.followed.on_model(mirror_m), self.followed.read_variance
-        memory = self._memory_of(flow, last)
+        memory = self._memory_of(flow)
         looked = self.followed.second.look(counts, usable, memory, read_variance=noise, known_m=known_m)
         if looked.turned:
             flow = flow._replace(moving_rad=flow.moving_rad + self.filter.modes_of(looked.change_rad))
         return flow, looked.ffts
 
     @eqx.filter_jit
-    def _memory_of(self, flow: Flow, last: Memory) -> Memory:
-        """The air as waves and a tilt."""
+    def _memory_of(self, flow: Flow) -> Memory:
+        """The air as waves and a tilt, as a second look wants it."""
         solver, phase_rad = self.filter.solver, self.filter.phase_rad(flow.whole_rad)
         slope = mean_slope(phase_rad, solver.level.light, solver.level.grid) * self._radian_m
-        rest_rad = phase_rad - tilt_phase(slope, solver.level.grid, solver.geometry.wavelength_m)
-        return eqx.tree_at(lambda one: (one.phase_rad, one.slope), last, (rest_rad, slope))
+        one, planes = jnp.ones((), phase_rad.dtype), jnp.ones((len(solver.geometry.distances_m), 1, 1))
+        return Memory(
+            phase_rad=phase_rad - tilt_phase(slope, solver.level.grid, solver.geometry.wavelength_m),
+            slope=slope,
+            left_open=jnp.zeros_like(solver.power),
+            tilt_left_rad=0 * one,
+            strength=self.strength * one,
+            scale=PlaneScale(planes, 0 * planes),
+            surprise_rad2=jnp.zeros(len(LAGS), phase_rad.dtype),
+        )
+
+    @eqx.filter_jit
+    def _flow_of_mirror(self, mirror_m: Float[Array, "lit_y lit_x"]) -> Flow:
+        """The air that a mirror corrects."""
+        return self.filter.begun(self.followed.reconstructor.phase_of(self.followed.on_model(mirror_m)))
 
     @eqx.filter_jit
     def _flow_of(self, memory: Memory) -> Flow:

@@ -5,11 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.modes import DIM, ModalBasis, modal_basis
 from nlcwfs.config import Config
 from nlcwfs.estimation.flow_filter import FlowFilter, Still, modal_information
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.moving_modes import Step
+from nlcwfs.estimation.phase_prior import expected_air
+from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC
 from nlcwfs.estimation.resolution_level import Measurement
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.feedback.controller import Telemetry
@@ -21,8 +24,10 @@ from nlcwfs.simulation.loop_measurement import FollowedCurvature
 BEYOND = 1.25
 """Modes that are filtered for each that the mirror makes: what is a little finer is carried to it as well."""
 
-AT_LEAST = 500
-"""... and not less than these, where the cells carry them."""
+AT_LEAST = 800
+"""... and not less than these, where the cells carry them: what the light shows and the filter does not hold is taken for
+something else. With 200 Zernikes on the mirror 500 modes were lost with every star, 800 keep one of magnitude 14 at the
+floor."""
 
 CELLS = 4
 """Lit cells for each mode, at least."""
@@ -35,7 +40,7 @@ DRAW = 20101
 
 
 def carried_curvature(
-    followed: FollowedCurvature, config: Config, light: LoopLight, telemetry: Telemetry
+    followed: FollowedCurvature, config: Config, light: LoopLight, telemetry: Telemetry | None
 ) -> CarriedCurvature | None:
     """The sensor with a filter for the wind that a closed loop has seen; None if no wind is clear.
 
@@ -43,14 +48,19 @@ def carried_curvature(
         followed: Has measured until now.
         config: The settings.
         light: Mirror and pupil.
-        telemetry: What was recorded.
+        telemetry: What was recorded; None where the wind is told.
+
+    Raises:
+        SettingsError: If the wind is told and the turbulence is not.
     """
     solver = followed.reconstructor.solver
     basis = filtered_basis(solver, light.mirror.count)
     air = learnt_air(config, basis, solver.level.grid, mirror_modes(followed, light, basis), telemetry)
     if air is None:
         return None
-    residual_m = air.shapes @ np.asarray(telemetry.measured_m[-1], float)
+    residual_m = np.zeros(basis.count)
+    if telemetry is not None:
+        residual_m = air.shapes @ np.asarray(telemetry.measured_m[-1], float)
     made = settled_filter(solver, air, residual_m, photons=light.still.photons, interval_s=1 / config.loop.rate_hz)
     return CarriedCurvature(
         followed=followed,
@@ -59,6 +69,8 @@ def carried_curvature(
         ahead=jnp.asarray(air.commands @ air.ahead, made.modes.dtype),
         mirror=light.mirror,
         wind=air.wind,
+        strength=(_prior_air(config).fried_m / air.turbulence.fried_m) ** (5 / 3),
+        starts_closed=config.loop.start == "closed",
     )
 
 
@@ -140,3 +152,10 @@ def seen_information(
     task = solver.task(measured, known_rad, PlaneScale(counts, 0 * counts), prior, jnp.ones((), dtype))
     phase_rad = known_rad + basis.combine(jnp.asarray(modes_rad, dtype))
     return modal_information(task.problem, phase_rad, basis)
+
+
+def _prior_air(config: Config) -> Turbulence:
+    """The turbulence behind the prior of the sensor's solver."""
+    settings, diameter_m = config.estimation, config.beam.diameter_m
+    told = settings.seeing_arcsec or TYPICAL_SEEING_ARCSEC
+    return expected_air(settings.prior, seeing_arcsec=told, diameter_m=diameter_m)

@@ -184,9 +184,9 @@ def still_wavelength_m(light: LoopLight) -> float:
 
 
 def _learns_at(loop: Loop, state: LoopState) -> int:
-    """Frame at which the controller learns; -1 if it never does."""
+    """Frame at which the loop learns; -1 if it never does."""
     settings = loop.config.loop
-    if loop.config.feedback.controller == "integrator" or state.closed_at < 0:
+    if not loop.learns or state.closed_at < 0:
         return -1
     return state.closed_at + max(64, round(settings.learn_after_s * settings.rate_hz))
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.exposure import Exposure
+from nlcwfs.simulation.loop_flow import carried_curvature
 from nlcwfs.simulation.loop_lenslet_light import LensletOptics
 from nlcwfs.simulation.loop_lenslets import FollowedSpots
 from nlcwfs.simulation.loop_light import LoopLight
@@ -64,6 +65,8 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         return FollowedSpots.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)
-    if config.estimation.method == "map" and config.loop.follow:
-        return FollowedCurvature.build(config, light)
+    if method == "map" and loop.follow:
+        followed = FollowedCurvature.build(config, light)
+        told = config.feedback.controller == "kalman" and config.estimation.prior.wind_direction_deg is not None
+        return (told and carried_curvature(followed, config, light, None)) or followed
     return SingleFrames.build(config, light)
