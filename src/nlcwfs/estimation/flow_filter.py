@@ -191,11 +191,11 @@ class FlowFilter(eqx.Module):
             total_rad = total_rad + known_rad
         total = plane_counts(measured)
         scale = PlaneScale(total, total * self.scattered / measured.counts[0].size)  # the haze of what is uncertain
-        one = jnp.ones((), self.modes.dtype)
-        task = eqx.tree_at(lambda s: s.level, solver, level).task(measured, total_rad, scale, self.prior, one)
+        dimmed = eqx.tree_at(lambda s: s.level, solver, level)
+        problem = dimmed.problem(measured, total_rad, scale, self.prior)
         unknown = self.prior.nothing()
         for _ in range(STEPS):
-            direction, _ = gn.direction_of_step(task.problem, INNER, unknown)
+            direction, _ = gn.direction_of_step(problem, INNER, unknown)
             unknown = gn.plus(unknown, direction, 1.0)
         change_rad = self.prior.root @ unknown.waves
         still_rad = self.to_still @ change_rad
@@ -222,7 +222,7 @@ def settled_sum(
     both = np.hstack([np.eye(count), np.eye(count, few)])
     again = scipy.linalg.block_diag(step.again, still.kept * np.eye(few))
     new = scipy.linalg.block_diag(step.new, np.diag(still.variance * (1 - still.kept**2)))
-    settled = settled_covariance(Step(again, new), both.T @ information @ both)
+    settled = settled_covariance(Step(np.asarray(again), np.asarray(new)), both.T @ information @ both)
     predicted = both @ settled @ both.T
     to_still = scipy.linalg.solve(predicted, both @ settled[:, count:], assume_a="pos").T
     return (predicted + predicted.T) / 2, to_still

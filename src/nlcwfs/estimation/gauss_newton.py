@@ -1,15 +1,14 @@
 """Fisher scoring: the Gauss-Newton method for counts of light, without matrices."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nlcwfs.estimation.modal_prior import ModalPrior
-from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase, scaled
+from nlcwfs.estimation.whitened_phase import Unknown, scaled
 
 BACKTRACKS = 3
 """A step that makes the fit worse is shortened so often before it is given up."""
@@ -18,7 +17,30 @@ SHORTER = 0.4
 """... each time to this part."""
 
 
-class Problem(NamedTuple):
+class Prior(Protocol):
+    """What is expected of a phase: unknowns of unit variance, see `WhitenedPhase`."""
+
+    def phase_rad(self, unknown: Unknown) -> Float[Array, "y x"]:
+        """The phase of these unknowns."""
+        ...
+
+    def transposed(self, gradient: Float[Array, "y x"]) -> Unknown:
+        """The transpose of `phase_rad`."""
+        ...
+
+    def dot(self, a: Unknown, b: Unknown) -> Float[Array, ""]:
+        """Inner product."""
+        ...
+
+    def preconditioner(self, information: Float[Array, ""], shown: Unknown) -> Unknown:
+        """About the inverse of the curvature of a fit."""
+        ...
+
+
+P = TypeVar("P", bound=Prior)
+
+
+class Problem(NamedTuple, Generic[P]):
     """Counts to be explained by a phase.
 
     Attributes:
@@ -37,7 +59,7 @@ class Problem(NamedTuple):
     usable: Bool[Array, "plane v u"]
     dark: Float[Array, "plane 1 1"]
     known_rad: Float[Array, "y x"]
-    prior: WhitenedPhase | ModalPrior
+    prior: P
     information: Float[Array, ""]
     shown: Unknown
 
@@ -146,7 +168,7 @@ def conjugate_gradients(
     curvature: Callable[[Unknown], Unknown],
     gradient: Unknown,
     preconditioner: Unknown,
-    prior: WhitenedPhase | ModalPrior,
+    prior: Prior,
     count: int,
 ) -> Unknown:
     """So many conjugate gradients towards `curvature^-1 gradient`, from zero, with a diagonal preconditioner.
@@ -155,6 +177,7 @@ def conjugate_gradients(
         A curvature of four for every unknown is solved by the first.
 
         >>> from nlcwfs.beam.grid import Grid
+        >>> from nlcwfs.estimation.whitened_phase import WhitenedPhase
         >>> prior = WhitenedPhase.build(Grid((8, 8), 1.0), jnp.ones((8, 5)), tilt_rms_rad=1.0, diameter_m=8.0)
         >>> pull = prior.start(jnp.zeros((8, 8)).at[2, 3].set(1.0), noise_variance=0.0)
         >>> same = Unknown(jnp.ones((8, 5)), jnp.ones(2))

@@ -14,7 +14,7 @@ from nlcwfs.estimation.resolution_level import Level, Measurement
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.estimation.turbulence_filter import expected_error
 from nlcwfs.estimation.turn_islands import tearing_ffts, torn_phase
-from nlcwfs.estimation.whitened_phase import Unknown
+from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
 
 LIT = 0.3
 """Cells with at least this share of the light of a full one have a phase of their own."""
@@ -74,7 +74,7 @@ class Task(NamedTuple):
         beyond: Variance of the phase that is finer than the model's cells, rad^2.
     """
 
-    problem: gn.Problem
+    problem: gn.Problem[WhitenedPhase]
     level: Level
     measured: Measurement
     scale: PlaneScale

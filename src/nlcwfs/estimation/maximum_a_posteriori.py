@@ -249,10 +249,17 @@ class MaximumAPosteriori(eqx.Module):
         strength: Float[Array, ""],
     ) -> Task:
         """What is to be solved for one exposure."""
+        problem = self.problem(measured, known_rad, scale, prior)
+        return Task(problem, self.level, measured, scale, self.beyond_cells * strength)
+
+    def problem(
+        self, measured: Measurement, known_rad: Float[Array, "y x"], scale: PlaneScale, prior: gn.P
+    ) -> gn.Problem[gn.P]:
+        """Counts, and what is expected of the phase behind them."""
         level, lit = self.level, jnp.sum(self.level.light)
         dark = self.settings.map.dark_share * scale.counts * level.oversampling**2 / lit + measured.read_variance
         photons = jnp.sum(jnp.where(measured.usable, measured.counts, 0))
-        problem = gn.Problem(
+        return gn.Problem(
             expected=lambda phase_rad: mean_counts(level, scale, phase_rad),
             counts=jnp.where(measured.usable, measured.counts, 0),
             usable=measured.usable,
@@ -262,7 +269,6 @@ class MaximumAPosteriori(eqx.Module):
             information=4 * jnp.maximum(photons, 1) / (SENSOR_LOSS * lit),
             shown=Unknown(jnp.ones((), self.power.dtype), jnp.ones(2, self.power.dtype)),
         )
-        return Task(problem, level, measured, scale, self.beyond_cells * strength)
 
     def account(self, found: Found) -> WavefrontEstimate:
         """Wavefront, error bars and verdict of the best solution."""

@@ -74,15 +74,16 @@ def displaced_covariance(
     for moved_y, moved_x in moves_m:
         for (dy, share_y), (dx, share_x) in itertools.product(INSIDE, repeat=2):
             apart_m = np.hypot(y + dy * pixel_m - moved_y, x + dx * pixel_m - moved_x)
-            kernel += scipy.fft.rfft2(-share_y * share_x / 2 * air.structure_m2(apart_m)) / len(moves_m)
+            kernel += np.asarray(scipy.fft.rfft2(-share_y * share_x / 2 * air.structure_m2(apart_m))) / len(moves_m)
     lit = weights > 0
     modes = np.asarray(basis.modes, float)
     rows = (modes * weights)[:, lit]
     smeared = np.empty_like(rows)
     for first in range(0, len(rows), FEW):
         part = slice(first, first + FEW)
-        spectra = scipy.fft.rfft2(modes[part] * weights, s=(2 * ny, 2 * nx)) * kernel
-        smeared[part] = scipy.fft.irfft2(spectra, s=(2 * ny, 2 * nx))[:, :ny, :nx][:, lit]
+        spectra = np.asarray(scipy.fft.rfft2(modes[part] * weights, s=(2 * ny, 2 * nx))) * kernel
+        whole = np.asarray(scipy.fft.irfft2(spectra, s=(2 * ny, 2 * nx)))
+        smeared[part] = whole[:, :ny, :nx][:, lit]
     return rows @ smeared.T
 
 

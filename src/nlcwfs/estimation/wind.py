@@ -92,15 +92,15 @@ class _Correlations(NamedTuple):
         slopes = np.stack([np.roll(opd_m, -1, axis + 1) - opd_m for axis in (0, 1)], axis=1) * both
         slopes -= slopes.sum((2, 3), keepdims=True) / both.sum((1, 2))[:, None, None] * both  # a tilt is no feature
         shape = 2 * lit.shape[0], 2 * lit.shape[1]
-        spectra = scipy.fft.rfft2(slopes.astype(np.float32), s=shape)
-        light = scipy.fft.rfft2(both.astype(float), s=shape)
-        overlap = scipy.fft.irfft2(np.abs(light) ** 2, s=shape).sum(0)
+        spectra = np.asarray(scipy.fft.rfft2(slopes.astype(np.float32), s=shape))
+        light = np.asarray(scipy.fft.rfft2(both.astype(float), s=shape))
+        overlap = np.asarray(scipy.fft.irfft2(np.abs(light) ** 2, s=shape)).sum(0)
         return cls(spectra, overlap, float(np.mean(slopes**2) * both[0].size * 2 / both.sum()))
 
     def peak(self, frames: int, near: tuple[float, float] | None) -> tuple[float, float, float] | None:
         """Where (y, x, in cells) wavefronts so many frames apart are most alike, and how much."""
         pairs = self.spectra[frames:] * np.conj(self.spectra[:-frames])
-        alike = scipy.fft.irfft2(pairs.mean(0).sum(0), s=self.overlap.shape)
+        alike = np.asarray(scipy.fft.irfft2(pairs.mean(0).sum(0), s=self.overlap.shape))
         share = self.overlap / self.overlap[0, 0]
         alike = np.where(share > OVERLAP, alike / (np.maximum(self.overlap, 1) * self.variance), -1.0)
         if near is not None:

@@ -25,8 +25,8 @@ BEYOND = 1.25
 """Modes that are filtered for each that the mirror makes: what is a little finer is carried to it as well."""
 
 AT_LEAST = 800
-"""... and not less than these, where the cells carry them: what the light shows and the filter does not hold is taken for
-something else. With 200 Zernikes on the mirror 500 modes were lost with every star, 800 keep one of magnitude 14 at the
+"""... and not less than these, where the cells carry them: what the light shows and the filter does not hold is taken
+for something else. With 200 Zernikes on the mirror 500 modes lost every star, 800 keep one of magnitude 14 at the
 floor."""
 
 CELLS = 4
@@ -149,9 +149,9 @@ def seen_information(
     counts = jnp.asarray(level.optics.flux_fractions, dtype)[:, None, None] * photons
     known_rad = solver.known_rad(jnp.zeros(2, dtype))
     prior = solver.prior(solver.power, solver.tilt_rms_rad)
-    task = solver.task(measured, known_rad, PlaneScale(counts, 0 * counts), prior, jnp.ones((), dtype))
+    problem = solver.problem(measured, known_rad, PlaneScale(counts, 0 * counts), prior)
     phase_rad = known_rad + basis.combine(jnp.asarray(modes_rad, dtype))
-    return modal_information(task.problem, phase_rad, basis)
+    return modal_information(problem, phase_rad, basis)
 
 
 def _prior_air(config: Config) -> Turbulence:
