@@ -41,7 +41,7 @@ def pupil():
 
 @pytest.mark.parametrize("outer_scale_m", [np.inf, 5.0])
 def test_new_air_is_what_drawn_frozen_flow_brings(pupil, outer_scale_m):
-    grid, basis = pupil
+    _, basis = pupil
     air, moved_m = Turbulence(0.15, outer_scale_m=outer_scale_m), (0.05, -0.2)
     now = displaced_covariance(basis, 0.1, air, [(0.0, 0.0)])
     step = carried(now, displaced_covariance(basis, 0.1, air, [moved_m]))

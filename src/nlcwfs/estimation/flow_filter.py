@@ -249,8 +249,8 @@ def modal_information(
     @jax.jit
     def rows(modes: Float[Array, "some y x"], phase: Float[Array, "y x"]) -> Float[Array, "some datum"]:
         model, along = jax.linearize(problem.expected, phase)
-        root = jnp.sqrt(problem.usable / (model + problem.dark))
-        return (jax.vmap(along)(modes) * root).reshape(len(modes), -1)
+        root = jnp.sqrt(problem.usable.astype(model.dtype) / (model + problem.dark))
+        return (jax.vmap(along)(modes) * root[None]).reshape(len(modes), -1)
 
     modes = jnp.asarray(basis.modes, phase_rad.dtype)
     parts = [np.asarray(rows(modes[k : k + CHUNK], phase_rad)) for k in range(0, basis.count, CHUNK)]

@@ -1,7 +1,7 @@
 """Fisher scoring: the Gauss-Newton method for counts of light, without matrices."""
 
 from collections.abc import Callable
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ SHORTER = 0.4
 """... each time to this part."""
 
 
+@runtime_checkable
 class Prior(Protocol):
     """What is expected of a phase: unknowns of unit variance, see `WhitenedPhase`."""
 
@@ -37,10 +38,7 @@ class Prior(Protocol):
         ...
 
 
-P = TypeVar("P", bound=Prior)
-
-
-class Problem(NamedTuple, Generic[P]):
+class Problem(NamedTuple):
     """Counts to be explained by a phase.
 
     Attributes:
@@ -59,7 +57,7 @@ class Problem(NamedTuple, Generic[P]):
     usable: Bool[Array, "plane v u"]
     dark: Float[Array, "plane 1 1"]
     known_rad: Float[Array, "y x"]
-    prior: P
+    prior: Prior
     information: Float[Array, ""]
     shown: Unknown
 

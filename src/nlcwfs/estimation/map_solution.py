@@ -68,13 +68,15 @@ class Task(NamedTuple):
 
     Attributes:
         problem: Counts and prior.
+        prior: What is expected of the phase.
         level: The sensor.
         measured: The counts, as the field's iterations take them.
         scale: Counts of each plane.
         beyond: Variance of the phase that is finer than the model's cells, rad^2.
     """
 
-    problem: gn.Problem[WhitenedPhase]
+    problem: gn.Problem
+    prior: WhitenedPhase
     level: Level
     measured: Measurement
     scale: PlaneScale
@@ -83,7 +85,7 @@ class Task(NamedTuple):
 
 def seen_modes(task: Task) -> Float[Array, ""]:
     """How many modes of the pupil the light shows better than the prior: the degrees of freedom of a fit."""
-    prior, light = task.problem.prior, task.level.light
+    prior, light = task.prior, task.level.light
     gain = task.problem.information * prior.amplitude**2
     return jnp.sum(light) / light.size * jnp.sum(prior.twice * gain / (1 + gain))
 
@@ -128,7 +130,7 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
         before: Steps and FFTs spent so far.
     """
     first = solved(task, settings, unknown, before)
-    sigma_rad = expected_error(task.problem.prior.amplitude**2, 1 / task.problem.information, task.level.grid)
+    sigma_rad = expected_error(task.prior.amplitude**2, 1 / task.problem.information, task.level.grid)
     near_rad = jnp.maximum(settings.agreement * sigma_rad, SMALLEST_ISLAND_RAD)
 
     def again(search: Search) -> Search:
@@ -155,8 +157,8 @@ def healed(task: Task, settings: MapSettings, solution: Solution) -> Solution:
         iterations=settings.healing_iterations,
         gain=settings.healing_gain,
     )
-    whole_rad = unwrapped(torn_rad - problem.known_rad, level.light > LIT, problem.prior)
-    start = problem.prior.start(whole_rad, noise_variance=1 / problem.information)
+    whole_rad = unwrapped(torn_rad - problem.known_rad, level.light > LIT, task.prior)
+    start = task.prior.start(whole_rad, noise_variance=1 / problem.information)
     ffts = tearing_ffts(problem.counts.shape[0], settings.healing_iterations) + unwrapping_ffts() + 1
     return solved(task, settings, start, (solution.steps, solution.ffts + ffts))
 

@@ -250,11 +250,11 @@ class MaximumAPosteriori(eqx.Module):
     ) -> Task:
         """What is to be solved for one exposure."""
         problem = self.problem(measured, known_rad, scale, prior)
-        return Task(problem, self.level, measured, scale, self.beyond_cells * strength)
+        return Task(problem, prior, self.level, measured, scale, self.beyond_cells * strength)
 
     def problem(
-        self, measured: Measurement, known_rad: Float[Array, "y x"], scale: PlaneScale, prior: gn.P
-    ) -> gn.Problem[gn.P]:
+        self, measured: Measurement, known_rad: Float[Array, "y x"], scale: PlaneScale, prior: gn.Prior
+    ) -> gn.Problem:
         """Counts, and what is expected of the phase behind them."""
         level, lit = self.level, jnp.sum(self.level.light)
         dark = self.settings.map.dark_share * scale.counts * level.oversampling**2 / lit + measured.read_variance

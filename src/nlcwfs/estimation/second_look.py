@@ -179,7 +179,7 @@ class SecondLook(eqx.Module):
         """The most likely phase near a moved one."""
         task, none = self._task(counts, usable, read_variance, known_m, memory), jnp.asarray(0, jnp.int32)
         noise = START_NOISE / task.problem.information
-        start = task.problem.prior.start(memory.phase_rad + move_rad, noise_variance=noise)
+        start = task.prior.start(memory.phase_rad + move_rad, noise_variance=noise)
         solution = solved(task, self.sequence.solver.settings.map, start, (none, none))
         return task.problem.prior.phase_rad(solution.unknown), solution
 

@@ -237,7 +237,7 @@ class SequenceReconstructor(eqx.Module):
         self, task: Task, unknown: Unknown, slope: Float[Array, "2"], mean_rad: Float[Array, "y x"], rms_rad: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Phase, slope and what is left open of both."""
-        problem, prior, level = task.problem, task.problem.prior, self.solver.level
+        problem, prior, level = task.problem, task.prior, self.solver.level
         phase_rad = mean_rad + prior.phase_rad(Unknown(unknown.waves, jnp.zeros_like(unknown.slope)))
         diameter_m, wavelength_m = self.solver.geometry.pupil.diameter_m, self.solver.geometry.wavelength_m
         # A tilt of unit rms over a disc is 2 r / R (Noll).

@@ -19,7 +19,7 @@ class Unknown(NamedTuple):
     """A phase in units of what the prior expects; each real number in it has unit variance.
 
     Attributes:
-        waves: Half-plane of Fourier coefficients (`rfft2`, orthonormal).
+        waves: Half-plane of Fourier coefficients (`rfft2`, orthonormal); or, of a `ModalPrior`, real unknowns.
         slope: Tilt along y and x: a window that repeats itself cannot hold one.
     """
 
@@ -111,8 +111,10 @@ class WhitenedPhase(eqx.Module):
         return Unknown(waves, 1 / (1 + information * shown.slope * lit / 8))
 
 
-def scaled(waves: Complex[Array, "..."], factor: Float[Array, "..."] | float) -> Complex[Array, "..."]:
-    """Waves times real numbers.
+def scaled(
+    waves: Complex[Array, "..."] | Float[Array, "..."], factor: Float[Array, "..."] | float
+) -> Complex[Array, "..."] | Float[Array, "..."]:
+    """Waves, or whatever the unknowns are, times real numbers.
 
     Examples:
         >>> complex(scaled(jnp.asarray(1 + 2j), jnp.asarray(2.0)))

@@ -104,15 +104,22 @@ class _Correlations(NamedTuple):
         share = self.overlap / self.overlap[0, 0]
         alike = np.where(share > OVERLAP, alike / (np.maximum(self.overlap, 1) * self.variance), -1.0)
         if near is not None:
-            rows = np.abs(np.fft.fftfreq(alike.shape[0], 1 / alike.shape[0]) - near[0]) > NEAR_CELLS
-            columns = np.abs(np.fft.fftfreq(alike.shape[1], 1 / alike.shape[1]) - near[1]) > NEAR_CELLS
-            alike[rows | (share.max(1) <= OVERLAP)], alike[:, columns] = -1.0, -1.0
+            rows, columns = (np.abs(_apart(place, size)) for place, size in zip(near, alike.shape, strict=True))
+            around = (rows[:, None] <= NEAR_CELLS) & (columns[None, :] <= NEAR_CELLS)
+            if share[around].min() <= OVERLAP:
+                return None  # the peak may lie where too little is left of the pupil
+            alike = np.where(around, alike, -1.0)
         row, column = np.unravel_index(int(np.argmax(alike)), alike.shape)
         if alike[row, column] <= 0:
             return None
         place = row + _vertex(alike[:, column], int(row)), column + _vertex(alike[row], int(column))
         wrapped = [(one + size / 2) % size - size / 2 for one, size in zip(place, alike.shape, strict=True)]
         return wrapped[0], wrapped[1], float(alike[row, column])
+
+
+def _apart(place: float, size: int) -> np.ndarray:
+    """Distance of each cell of a correlation from a place, along one axis that repeats itself."""
+    return (np.arange(size) - place + size / 2) % size - size / 2
 
 
 def _vertex(values: np.ndarray, at: int) -> float:

@@ -119,8 +119,10 @@ class CarriedCurvature(eqx.Module):
         """An exposure of air that is carried."""
         flow, code, surprise = self._followed(counts, usable, mirror_m, before, jnp.asarray(state.calm))
         outcome, ffts, every = Outcome(int(code)), self.filter.ffts, self.followed.look_again_every
-        doubts, since, calm = state.doubts + 1, state.since + 1, state.calm
-        if outcome.succeeded:
+        doubts, since, calm = state.doubts, state.since + 1, state.calm
+        if outcome is Outcome.NOT_EXPLAINED:
+            doubts += 1  # not in the dark, where the wind goes on
+        elif outcome.succeeded:
             doubts, calm = 0, calm + (float(surprise) - calm) / CALM_FRAMES
             if every and since >= every:
                 flow, more = self._looked_again(counts, usable, mirror_m, flow)
