@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import modal_basis
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.moving_modes import Step, carried, displaced_covariance
+from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.feedback.controller import Telemetry
 from nlcwfs.interop import loop_folder as folder_of
 from nlcwfs.simulation.loop import Loop
@@ -93,8 +95,8 @@ def test_it_leaves_less_than_the_integrator():
 
 
 def test_the_error_is_what_it_expects():
-    """Of the modes that the mirror makes, an exposure ahead. Half of it is in the slow modes below 4 cycles, of which 65
-    exposures of one sky hold few independent moments: 40 % either way."""
+    """Of the modes that the mirror makes, an exposure ahead. Half of it is in the slow modes below 4 cycles, of which
+    65 exposures of one sky hold few independent moments: 40 % either way."""
     loop, told = ran(*CARRIED)
     sensor = loop.measurement
     assert isinstance(sensor, CarriedSpots)
@@ -141,6 +143,29 @@ def test_while_exposures_are_lost_the_wind_goes_on():
     np.testing.assert_allclose(after.modes_m, carried_m, atol=1e-5 * np.abs(carried_m).max())
     np.testing.assert_allclose(command_m, ahead @ carried_m, atol=1e-5 * np.abs(command_m).max())
     assert np.abs(carried_m - modes_m).max() > 1e-8
+
+
+def test_an_exposure_in_the_dark_moves_nothing_but_the_wind():
+    loop, _ = ran(*CARRIED)
+    sensor, state = loop.measurement, loop.init()
+    assert isinstance(sensor, CarriedSpots)
+    memory = CarriedSpotsState(
+        jnp.asarray(1e-7 * np.random.default_rng(3).normal(size=len(sensor.again)), jnp.float32),
+        sensor.followed.begun,
+        jnp.ones(sensor.interaction.shape[::-1], jnp.float32),
+        1e-8,
+        9,
+    )
+    flat_m = jnp.zeros_like(loop.light.weights)
+    exposure = loop.light.expose(jnp.asarray(0, jnp.int32), state.control.line, state.image, flat_m).exposure
+    dark = eqx.tree_at(lambda one: one.frames.electrons, exposure, 0 * exposure.frames.electrons)
+    sight, after = sensor.measure(dark, jnp.ones(dark.frames.electrons.shape, bool), flat_m, memory)
+    command_m, wanted = sensor.skip(memory)
+    assert sight.outcome == Outcome.NO_LIGHT
+    assert isinstance(after, CarriedSpotsState)
+    np.testing.assert_array_equal(after.modes_m, wanted.modes_m)
+    np.testing.assert_array_equal(sight.command_m, command_m)
+    np.testing.assert_array_equal(after.spot, memory.spot)
 
 
 def test_an_interrupted_run_ends_as_one_that_was_not(tmp_path):

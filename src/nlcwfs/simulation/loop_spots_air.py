@@ -24,7 +24,9 @@ FINE = 4.0
 exposures a second: 4 and 8 leave 66.6 nm, and take 12 and 29 s."""
 
 FARTHEST = 1.5
-"""Waves finer than the modes count up to so many times the highest frequency of the modes."""
+"""Waves finer than the modes count up to so many times the highest frequency of the modes, as noise that is new in each
+exposure. It is not: the wind carries it on as well. Measured, D/d = 36 at 420 exposures a second, 0.2 to 0.5 s after
+learning: with 1, 4 and 16 times their variance 66.6, 66.4 and 66.3 nm; with half as many modes again 66.3."""
 
 WAVES = 256
 """Waves that are pushed through the lenslets at a time."""
