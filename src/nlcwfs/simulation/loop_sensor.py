@@ -59,10 +59,7 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     loop, method = config.loop, config.estimation.method
     carries = loop.sensor == "shack-hartmann" or (loop.sensor == "curvature" and method == "map" and loop.follow)
     if config.feedback.controller == "kalman" and not carries:
-        rule = (
-            "filters the air of loop.sensor = shack-hartmann, or curvature with estimation.method = map and "
-            "loop.follow, only"
-        )
+        rule = "filters the air of loop.sensor = shack-hartmann, or of curvature with method = map and loop.follow"
         raise SettingsError("feedback.controller", rule, "kalman")
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
