@@ -18,8 +18,8 @@ class FeedbackSettings(BaseModel):
     controller: Literal["integrator", "modal-gains", "predictive", "kalman"] = Field(
         default="integrator",
         description="the same gain for every mode; a gain for each mode, learnt; a prediction of each mode, learnt; or "
-        "Kalman's filter of the air that the wind carries, the wind learnt (curvature sensor with method map). What "
-        "learns is an integrator until it has learnt",
+        "Kalman's filter of the air that the wind carries, the wind learnt (curvature sensor with method map, or "
+        "lenslets). What learns is an integrator until it has learnt",
     )
     gain: float = Field(default=1.0, gt=0, le=2, description="share of a measured error that the next command corrects")
     leak: float = Field(

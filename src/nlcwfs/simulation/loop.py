@@ -21,10 +21,12 @@ from nlcwfs.science.rms_groups import rms_groups
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.loop_faults import bump_rms_m, bump_shape, damaged, fault_in
 from nlcwfs.simulation.loop_flow import carried_curvature
+from nlcwfs.simulation.loop_lenslets import FollowedSpots
 from nlcwfs.simulation.loop_light import LoopLight
 from nlcwfs.simulation.loop_measurement import FollowedCurvature
 from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor
 from nlcwfs.simulation.loop_sight import Sight
+from nlcwfs.simulation.loop_spots_air import carried_spots
 
 GROUPS = ("tip_tilt", "low", "middle", "high", "beyond")
 """Groups of modes in the order of `Record.group_nm2`: tilt, below 4 cycles per aperture, 4 to 12, above, the rest."""
@@ -164,6 +166,8 @@ class Loop:
         elif isinstance(self.measurement, FollowedCurvature):
             filtered = carried_curvature(self.measurement, self.config, self.light, telemetry)
             self.measurement = filtered or self.measurement
+        elif isinstance(self.measurement, FollowedSpots):
+            self.measurement = carried_spots(self.measurement, self.config, self.light, telemetry) or self.measurement
 
     @cached_property
     def _bump(self) -> Float[Array, "lit_y lit_x"]:

@@ -13,6 +13,7 @@ from nlcwfs.config import Config
 from nlcwfs.estimation.loop_reconstructor import loop_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.spot_centroids import (
+    Slopes,
     SpotFilter,
     centre_of_gravity,
     matched_filter,
@@ -104,7 +105,7 @@ class FollowedSpots(eqx.Module):
     ) -> tuple[Sight, SpotsState | None]:
         """What an exposure shows; see `LoopSensor`."""
         electrons = exposure.frames.electrons
-        total = float(self._total(electrons))
+        total = self.total(electrons)
         if not total > 0:
             rest_m = jnp.zeros(self.modes.count, self.begun.dtype)
             return Sight(rest_m, Outcome.NO_LIGHT, math.nan, 0, False), memory
@@ -146,6 +147,46 @@ class FollowedSpots(eqx.Module):
             return weighted_centre_of_gravity(model, fwhm_rad=width_rad)
         return centre_of_gravity(model, threshold=settings.threshold if settings.centroid == "thresholded" else 0.0)
 
+    def total(self, electrons: Float[Array, "spot v u"]) -> float:
+        """Electrons of a whole exposure that are looked at."""
+        return float(self._total(electrons))
+
+    def noise_rad2(self, spot: Float[Array, "1 v u"], total: float) -> Float[np.ndarray, " slope"]:
+        """Variance of every slope, along y and then x of each spot, from photon and read noise.
+
+        Args:
+            spot: Mean spot.
+            total: Electrons of a whole exposure.
+        """
+        spots = self.filter_of(spot, total)
+        if self.settings.centroid == "thresholded":  # its noise has no closed form; that of all light is near
+            spots = centre_of_gravity(SpotModel.of_mean(spot, pixel_rad=self.optics.sensor.pixel_rad))
+        extra = self.optics.still.detector.variance_without_light
+        of_photons = np.asarray(spots.variance(spot), float)
+        of_pixels = np.asarray(spots.variance(spot, extra_electrons2=1.0), float) - of_photons
+        flux = np.asarray(self.light, float)[:, None] * total
+        return (of_photons / flux + extra * of_pixels / flux**2).ravel()
+
+    def slopes(
+        self,
+        electrons: Float[Array, "spot v u"],
+        usable: Bool[Array, "spot v u"],
+        spot: Float[Array, "1 wv wu"],
+        total: Float[Array, ""],
+    ) -> tuple[Slopes, Float[Array, "1 wv wu"]]:
+        """Slopes of an exposure, and what its spots look like in the mean.
+
+        Args:
+            electrons: Photo-electrons of every pixel, background subtracted.
+            usable: Pixels that were read; a spot that lacks one has no weight.
+            spot: Mean spot.
+            total: Electrons of the whole exposure.
+        """
+        electrons, whole = self._window(electrons), jnp.all(self._window(usable), axis=(1, 2))
+        slopes = self.filter_of(spot, total).measure_faint(electrons, self.light)
+        weight = slopes.weight * whole.astype(slopes.weight.dtype)
+        return Slopes(slopes.slope, weight), MeanSpot(spot, 0.0).updated(electrons).shape
+
     @property
     def _lambda_over_d(self) -> float:
         sensor = self.optics.sensor
@@ -171,15 +212,7 @@ class FollowedSpots(eqx.Module):
 
     def _made(self, state: SpotsState, total: float, *, closed: bool) -> SpotsState:
         """The same with a reconstructor for the spots and the light as they are."""
-        spots = self.filter_of(state.spot, total)
-        if self.settings.centroid == "thresholded":  # its noise has no closed form; that of all light is near
-            spots = centre_of_gravity(SpotModel.of_mean(state.spot, pixel_rad=self.optics.sensor.pixel_rad))
-        extra = self.optics.still.detector.variance_without_light
-        of_photons = np.asarray(spots.variance(state.spot), float)
-        of_pixels = np.asarray(spots.variance(state.spot, extra_electrons2=1.0), float) - of_photons
-        flux = np.asarray(self.light, float)[:, None] * total
-        noise = of_photons / flux + extra * of_pixels / flux**2
-        made = loop_reconstructor(self.modes.known, noise_rad2=noise.ravel(), closed=closed)
+        made = loop_reconstructor(self.modes.known, noise_rad2=self.noise_rad2(state.spot, total), closed=closed)
         matrix = jnp.asarray(self.modes.commands(made.matrix), self.begun.dtype)
         return state._replace(matrix=matrix, predicted_m=math.sqrt(float(np.sum(made.error_m2))))
 
@@ -193,11 +226,8 @@ class FollowedSpots(eqx.Module):
     ) -> tuple[Float[Array, " mode"], Float[Array, "1 wv wu"]]:
         """Modes of the residual, and the mean spot with this exposure in it."""
         (spot, matrix), (total, memory) = known, numbers
-        electrons, whole = self._window(electrons), jnp.all(self._window(usable), axis=(1, 2))
-        slopes = self.filter_of(spot, total).measure_faint(electrons, self.light)
-        weight = slopes.weight * whole.astype(slopes.weight.dtype)
-        residual_m = matrix @ (slopes.slope * weight[:, None]).ravel()
-        seen = MeanSpot(spot, 0.0).updated(electrons).shape
+        slopes, seen = self.slopes(electrons, usable, spot, total)
+        residual_m = matrix @ (slopes.slope * slopes.weight[:, None]).ravel()
         return residual_m, memory * spot + (1 - memory) * seen
 
 

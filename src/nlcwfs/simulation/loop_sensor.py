@@ -58,8 +58,9 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         SettingsError: If settings contradict each other.
     """
     loop, method = config.loop, config.estimation.method
-    if config.feedback.controller == "kalman" and not (loop.sensor == "curvature" and method == "map" and loop.follow):
-        rule = "filters the air of loop.sensor = curvature with estimation.method = map and loop.follow only"
+    carries = loop.sensor == "shack-hartmann" or (loop.sensor == "curvature" and method == "map" and loop.follow)
+    if config.feedback.controller == "kalman" and not carries:
+        rule = "filters the air of loop.sensor = shack-hartmann, or of curvature with method = map and loop.follow"
         raise SettingsError("feedback.controller", rule, "kalman")
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
