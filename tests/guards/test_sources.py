@@ -32,6 +32,7 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
     "nlcwfs.estimation.gauss_newton:step": "needs a sensor; `MaximumAPosteriori` shows what steps lead to",
     "nlcwfs.estimation.gauss_newton:direction_of_step": "the same",
+    "nlcwfs.simulation.loop_sensor:build_sensor": "needs a loop's light; `nlcwfs loop` shows it",
     "nlcwfs.estimation.turn_islands:torn_phase": "needs a sensor and its light",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",

@@ -1,5 +1,6 @@
 """`nlcwfs loop`: close the loop, and keep what happened."""
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,8 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
         stamp = Provenance.collect(config.model_dump(mode="json"), seed=config.seed, device=device())
         kept(out, config, lambda folder: _write(running, folder, state, records, (numbers, stamp)))
     say(f"Wrote {out}.", quiet=quiet)
+    if config.feedback.controller == "kalman" and numbers["wind"] is None:
+        warn("no clear wind was found in loop.learn_after_s, or the run ended before: the loop stayed an integrator")
     if numbers["outcome"] != "closed":
         warn(f"the loop is {numbers['outcome']}: {reason(numbers)}")
         return NOT_A_SUCCESS
@@ -127,6 +130,9 @@ def account(numbers: dict) -> list[str]:
             f"Bounds: mirror {bounds['fitting_nm']:.0f} nm, lag {bounds['lag_nm']:.0f}, "
             f"quantum limit {bounds['photon_nm']:.0f}, all {bounds['floor_nm']:.0f}; open {bounds['open_loop_nm']:.0f}."
         )
+    if numbers["wind"] is not None:
+        y, x = numbers["wind"]["y_m_per_s"], numbers["wind"]["x_m_per_s"]
+        lines.append(f"Wind {math.hypot(y, x):.1f} m/s towards {math.degrees(math.atan2(y, x)):.0f} deg from +x to +y.")
     if numbers["strehl"] is not None:
         lines.append(f"Strehl {numbers['strehl']:.3f} at {numbers['science_wavelength_um']:g} um.")
     return lines

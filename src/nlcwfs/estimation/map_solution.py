@@ -83,6 +83,22 @@ class Task(NamedTuple):
     beyond: Float[Array, ""]
 
 
+class Found(NamedTuple):
+    """What one exposure led to.
+
+    Attributes:
+        task: What was to be solved.
+        search: The solutions.
+        slope: Starting tilt (y, x), metres per metre.
+        strength: Variance of the turbulence over that of the prior.
+    """
+
+    task: Task
+    search: Search
+    slope: Float[Array, "2"]
+    strength: Float[Array, ""]
+
+
 def seen_modes(task: Task) -> Float[Array, ""]:
     """How many modes of the pupil the light shows better than the prior: the degrees of freedom of a fit."""
     prior, light = task.prior, task.level.light

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +16,7 @@ from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share
 from nlcwfs.estimation.gerchberg_saxton import phase_noise
 from nlcwfs.estimation.ladder import finest_level
 from nlcwfs.estimation.map_error import MapError
-from nlcwfs.estimation.map_solution import Search, Task, searched
+from nlcwfs.estimation.map_solution import Found, Task, searched
 from nlcwfs.estimation.map_verdict import map_verdict
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air, prior_power
@@ -41,22 +40,6 @@ photons, with a scatter of 0.12 to 0.18."""
 
 START_NOISE = 0.1
 """Share of the phase noise that is filtered from the first guess, which is smooth already."""
-
-
-class Found(NamedTuple):
-    """What one exposure led to.
-
-    Attributes:
-        task: What was to be solved.
-        search: The solutions.
-        slope: Starting tilt (y, x), metres per metre.
-        strength: Variance of the turbulence over that of the prior.
-    """
-
-    task: Task
-    search: Search
-    slope: Float[Array, "2"]
-    strength: Float[Array, ""]
 
 
 class MaximumAPosteriori(eqx.Module):

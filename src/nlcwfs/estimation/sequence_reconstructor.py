@@ -17,9 +17,9 @@ from nlcwfs.estimation.frame_prediction import (
     unseen_share,
     wind_carriage,
 )
-from nlcwfs.estimation.map_solution import Task
+from nlcwfs.estimation.map_solution import Found, Task
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
-from nlcwfs.estimation.maximum_a_posteriori import Found, MaximumAPosteriori
+from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS
 from nlcwfs.estimation.resolution_level import cropped

@@ -24,7 +24,7 @@ from nlcwfs.simulation.loop_flow import carried_curvature
 from nlcwfs.simulation.loop_lenslets import FollowedSpots
 from nlcwfs.simulation.loop_light import LoopLight
 from nlcwfs.simulation.loop_measurement import FollowedCurvature
-from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor
+from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor, wind_is_told
 from nlcwfs.simulation.loop_sight import Sight
 from nlcwfs.simulation.loop_spots_air import carried_spots
 
@@ -150,10 +150,8 @@ class Loop:
 
     @property
     def learns(self) -> bool:
-        """Whether there is anything to learn: a wind that is told is not."""
-        kind = self.config.feedback.controller
-        told = kind == "kalman" and self.config.estimation.prior.wind_direction_deg is not None
-        return kind != "integrator" and not told
+        """Whether there is anything to learn: a filter whose wind is told works from the start."""
+        return self.config.feedback.controller != "integrator" and not wind_is_told(self.config)
 
     def learn(self, telemetry: Telemetry) -> None:
         """Gains, predictions or the wind, from what was recorded; a loop without a clear wind goes on as it was.

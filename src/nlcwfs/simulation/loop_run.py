@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.estimation.wind import Wind
 from nlcwfs.feedback.controller import Telemetry
 from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
 from nlcwfs.simulation.loop_light import LoopLight
@@ -136,10 +137,17 @@ def summary(loop: Loop, state: LoopState, records: Sequence[Record], seconds: fl
         "frames_to_close": None if state.closed_at < 0 else int(state.closed_at),
         "frames_not_believed": int(np.sum(~believed)),
         "ffts_per_frame": float(np.median(told.ffts[first:])) if len(counted) else None,
+        "wind": told_wind(loop),
         "latency_s": loop.config.feedback.latency_frames / settings.rate_hz,
         "seconds": round(seconds, 2),
         "bounds": bounds,
     }
+
+
+def told_wind(loop: Loop) -> dict[str, float] | None:
+    """The wind that Kalman's filter reckons with; None of a loop without, or that has found none."""
+    wind: Wind | None = getattr(loop.measurement, "wind", None)
+    return None if wind is None else {name: round(value, 3) for name, value in wind._asdict().items()}
 
 
 def counted_from(loop: Loop, state: LoopState) -> int:

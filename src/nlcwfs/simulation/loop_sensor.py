@@ -68,6 +68,17 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         return IdealMeasurement(light)
     if method == "map" and loop.follow:
         followed = FollowedCurvature.build(config, light)
-        told = config.feedback.controller == "kalman" and config.estimation.prior.wind_direction_deg is not None
-        return (told and carried_curvature(followed, config, light, None)) or followed
+        return (wind_is_told(config) and carried_curvature(followed, config, light, None)) or followed
     return SingleFrames.build(config, light)
+
+
+def wind_is_told(config: Config) -> bool:
+    """Whether Kalman's filter of the curvature sensor can be made before anything was seen.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> wind_is_told(load_config(None, ["feedback.controller=kalman", "estimation.prior.wind_direction_deg=30"]))
+        True
+    """
+    told = config.feedback.controller == "kalman" and config.estimation.prior.wind_direction_deg is not None
+    return told and config.loop.sensor == "curvature"
