@@ -82,6 +82,12 @@ def test_rates_are_medians_over_seeds_with_their_range(tmp_path):
     assert draw_rates(tmp_path, rows[9:]) is None
 
 
+@pytest.mark.parametrize("rate", ["", np.nan])
+def test_a_sweep_that_varies_no_rate_has_no_curve_of_rates(tmp_path, rate):
+    rows = [row("a", 0, seed, 80.0) | {"loop.rate_hz": rate} for seed in range(3)]
+    assert draw_rates(tmp_path, rows) is None
+
+
 def test_images_show_one_curve_a_case(tmp_path):
     rows = [row("a", 200, seed, 80.0) for seed in (0, 1)] + [row("b", 200, 0, 120.0)]
     assert draw_images(tmp_path, rows) is None

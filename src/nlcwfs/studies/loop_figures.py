@@ -28,7 +28,7 @@ def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
     curves = {}
     for case, members in _by_case(rows).items():
         told = over_seeds(members, [RATE])
-        told = sorted((row for row in told if int(row["closed"])), key=lambda row: float(row[RATE]))
+        told = sorted((row for row in told if int(row["closed"]) and row[RATE] != ""), key=lambda row: float(row[RATE]))
         curves[case] = told if len(told) >= LEAST_RATES else []
     return _curves(curves, RATE, "exposures a second")
 
