@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+import scipy.ndimage
+from jaxtyping import Bool, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.errors import SamplingError, SettingsError
@@ -193,3 +194,15 @@ def _antialiased(lit, grid: Grid) -> np.ndarray:
     x_parts_m = x_m[edge][:, None, None] + steps_m[None, :]
     pupil[edge] = lit(y_parts_m, x_parts_m, part_m).mean(axis=(1, 2))
     return pupil
+
+
+def nearest_lit(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
+    """For every pixel the number of the lit one that is nearest, counted along the rows.
+
+    Examples:
+        >>> nearest_lit(np.array([[True, False, False, True]])).tolist()
+        [[0, 0, 1, 1]]
+    """
+    number = np.cumsum(lit).reshape(lit.shape) - 1
+    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
+    return number[row, column]

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-import scipy.ndimage
 from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.modal_prior import ModalPrior
@@ -134,7 +134,7 @@ class FlowFilter(eqx.Module):
             prior=ModalPrior.build(modes, predicted, information, lit, level.grid.shape, str(dtype)),
             modes=jnp.asarray(modes, dtype),
             weights=jnp.asarray(weights.ravel()[lit], dtype),
-            nearest=jnp.asarray(_nearest(weights > 0)),
+            nearest=jnp.asarray(nearest_lit(weights > 0)),
             left_rad=float(np.sqrt(np.trace(left_covariance(predicted, information)))),
         )
 
@@ -226,13 +226,6 @@ def settled_sum(
     predicted = both @ settled @ both.T
     to_still = scipy.linalg.solve(predicted, both @ settled[:, count:], assume_a="pos").T
     return (predicted + predicted.T) / 2, to_still
-
-
-def _nearest(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
-    """For each cell the number of the lit one that is nearest."""
-    number = np.cumsum(lit).reshape(lit.shape) - 1
-    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
-    return number[row, column]
 
 
 def modal_information(

@@ -6,12 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import DIM
-from nlcwfs.beam.pupil import light_weights
+from nlcwfs.beam.pupil import light_weights, nearest_lit
 from nlcwfs.errors import SamplingError, SettingsError
 from nlcwfs.mirror.settings import MirrorSettings
 from nlcwfs.mirror.shapes import actuator_shapes, fourier_shapes, karhunen_loeve_shapes, zernike_shapes
@@ -108,7 +107,7 @@ class Mirror(eqx.Module):
             fit, condition, rank = _least_squares(shapes, light)
         rows, columns = np.nonzero(lit)
         return cls(
-            shapes=jnp.asarray(shapes.T[:, _nearest(bright)[lit]], dtype),
+            shapes=jnp.asarray(shapes.T[:, nearest_lit(bright)[lit]], dtype),
             fit=jnp.asarray(_spread(fit, bright[lit], dtype)),
             rows=jnp.asarray(rows),
             columns=jnp.asarray(columns),
@@ -166,13 +165,6 @@ def _least_squares(
     keep = strength > WORTH_FITTING**2 * strength[-1]
     inverse = (vectors[:, keep] / strength[keep]) @ vectors[:, keep].T
     return inverse @ weighted, float(np.sqrt(strength[-1] / strength[keep][0])), int(keep.sum())
-
-
-def _nearest(bright: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:
-    """For every pixel the number of the bright one that is nearest, counted along the rows."""
-    number = np.cumsum(bright).reshape(bright.shape) - 1
-    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~bright, return_distances=False, return_indices=True))
-    return number[row, column]
 
 
 def _spread(fit: Float[np.ndarray, "mode pixel"], seen: np.ndarray, dtype: str) -> np.ndarray:

@@ -15,6 +15,7 @@ from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.moving_modes import DIRECTIONS, Step, carried, displaced_covariance
 from nlcwfs.estimation.phase_prior import expected_air
+from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC
 from nlcwfs.estimation.wind import Wind, found_wind
 from nlcwfs.feedback.controller import Telemetry
 
@@ -144,13 +145,25 @@ def _seen_wind(
     return found_wind(opd_m, lit[rows, columns], pixel_m=grid.pixel_m, interval_s=interval_s)
 
 
+def prior_air(config: Config) -> Turbulence:
+    """The turbulence behind the prior of a solver: what the settings tell of it, or typical.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> round(prior_air(load_config(None, ["estimation.seeing_arcsec=0.6"])).fried_m, 3)
+        0.168
+    """
+    settings, diameter_m = config.estimation, config.beam.diameter_m
+    told = settings.seeing_arcsec or TYPICAL_SEEING_ARCSEC  # not looked at where Fried's parameter is told
+    return expected_air(settings.prior, seeing_arcsec=told, diameter_m=diameter_m)
+
+
 def _told_air(config: Config) -> Turbulence | None:
     """The turbulence that the settings tell."""
     settings = config.estimation
     if settings.seeing_arcsec is None and settings.prior.fried_m is None:
         return None
-    told = settings.seeing_arcsec or 1.0  # not looked at where Fried's parameter is told
-    return expected_air(settings.prior, seeing_arcsec=told, diameter_m=config.beam.diameter_m)
+    return prior_air(config)
 
 
 def _seen_air(

@@ -5,18 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.modes import DIM, ModalBasis, modal_basis
 from nlcwfs.config import Config
 from nlcwfs.estimation.flow_filter import FlowFilter, Still, modal_information
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.moving_modes import Step
-from nlcwfs.estimation.phase_prior import expected_air
-from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC
 from nlcwfs.estimation.resolution_level import Measurement
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.feedback.controller import Telemetry
-from nlcwfs.simulation.loop_air import MovingAir, learnt_air
+from nlcwfs.simulation.loop_air import MovingAir, learnt_air, prior_air
 from nlcwfs.simulation.loop_carried import CarriedCurvature
 from nlcwfs.simulation.loop_light import LoopLight
 from nlcwfs.simulation.loop_measurement import FollowedCurvature
@@ -69,7 +66,7 @@ def carried_curvature(
         ahead=jnp.asarray(air.commands @ air.ahead, made.modes.dtype),
         mirror=light.mirror,
         wind=air.wind,
-        strength=(_prior_air(config).fried_m / air.turbulence.fried_m) ** (5 / 3),
+        strength=(prior_air(config).fried_m / air.turbulence.fried_m) ** (5 / 3),
         starts_closed=config.loop.start == "closed",
     )
 
@@ -152,10 +149,3 @@ def seen_information(
     problem = solver.problem(measured, known_rad, PlaneScale(counts, 0 * counts), prior)
     phase_rad = known_rad + basis.combine(jnp.asarray(modes_rad, dtype))
     return modal_information(problem, phase_rad, basis)
-
-
-def _prior_air(config: Config) -> Turbulence:
-    """The turbulence behind the prior of the sensor's solver."""
-    settings, diameter_m = config.estimation, config.beam.diameter_m
-    told = settings.seeing_arcsec or TYPICAL_SEEING_ARCSEC
-    return expected_air(settings.prior, seeing_arcsec=told, diameter_m=diameter_m)

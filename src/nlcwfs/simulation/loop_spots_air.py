@@ -3,12 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 from jaxtyping import Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import DIM, KOLMOGOROV_SPECTRUM, ModalBasis, modal_basis
+from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.config import Config
 from nlcwfs.constants import SEEING_WAVELENGTH_M
 from nlcwfs.feedback.controller import Telemetry
@@ -106,8 +106,7 @@ def finer_rad2(
 def _on_cells(basis: ModalBasis, lit: np.ndarray) -> Float[np.ndarray, "mode lit"]:
     """Modes on all lit cells; dim ones take the value of their nearest bright neighbour, as of a mirror."""
     bright = np.asarray(basis.weights) > 0
-    row, column = np.asarray(scipy.ndimage.distance_transform_edt(~bright, return_distances=False, return_indices=True))
-    return np.asarray(basis.modes, float)[:, row[lit], column[lit]]
+    return np.asarray(basis.modes, float)[:, bright][:, nearest_lit(bright)[lit]]
 
 
 def coarser(basis: ModalBasis, grid: Grid) -> tuple[ModalBasis, Grid]:
