@@ -17,9 +17,9 @@ from astropy.table import Table
 
 from nlcwfs.config import load_config
 from nlcwfs.interop import Provenance
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_run import LoopTelemetry, run_loop, summary
-from nlcwfs.simulation.loop_seed import reseeded
+from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, run_loop, summary
+from nlcwfs.simulation.closed_loop.seed import reseeded
 
 PAPER = [
     "atmosphere.seeing_arcsec=0.6",

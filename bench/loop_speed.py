@@ -20,14 +20,17 @@ from astropy.table import Table
 from loop import PAPER
 from nlcwfs.config import load_config
 from nlcwfs.interop import Provenance
-from nlcwfs.simulation.loop import Loop
+from nlcwfs.simulation.closed_loop.loop import Loop
 
 SENSORS = {
     "ideal": ["loop.sensor=ideal"],
     "curvature, followed": [],
     "curvature, each frame alone": ["loop.follow=false"],
+    "curvature, kalman, wind told": ["feedback.controller=kalman", "estimation.prior.wind_direction_deg=0"],
     "curvature, gerchberg-saxton": ["estimation.method=gerchberg-saxton"],
+    "shack-hartmann, D/d 18": ["loop.sensor=shack-hartmann", "shack_hartmann.subapertures=18"],
     "shack-hartmann, D/d 36": ["loop.sensor=shack-hartmann", "shack_hartmann.subapertures=36"],
+    "shack-hartmann, D/d 60": ["loop.sensor=shack-hartmann", "shack_hartmann.subapertures=60"],
 }
 """What is timed, and the settings that make it; the first is what the others are compared with."""
 

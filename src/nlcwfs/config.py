@@ -25,7 +25,7 @@ from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.feedback.settings import FeedbackSettings
 from nlcwfs.mirror.settings import MirrorSettings
-from nlcwfs.simulation.loop_settings import LoopSettings
+from nlcwfs.simulation.closed_loop.settings import LoopSettings
 from nlcwfs.simulation.settings import SimulationSettings
 
 _PRESET = ["detector", "preset"]

@@ -10,12 +10,12 @@ from nlcwfs.config import load_config
 from nlcwfs.errors import SettingsError
 from nlcwfs.feedback.controller import Telemetry
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation import loop_air
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_carried import CarriedCurvature, CarriedState
-from nlcwfs.simulation.loop_flow import filtered_basis
-from nlcwfs.simulation.loop_measurement import FollowedCurvature
-from nlcwfs.simulation.loop_run import LoopTelemetry, loop_bounds, run_loop
+from nlcwfs.simulation.closed_loop import air as loop_air
+from nlcwfs.simulation.closed_loop.carried import CarriedCurvature, CarriedState
+from nlcwfs.simulation.closed_loop.flow import filtered_basis
+from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, loop_bounds, run_loop
 
 KALMAN = ("feedback.controller=kalman", "loop.learn_after_s=0.15", "loop.seconds=0.36")
 UNTOLD = [setting for setting in SMALL if not setting.startswith("estimation.seeing_arcsec")]

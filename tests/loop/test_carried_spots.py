@@ -16,11 +16,11 @@ from nlcwfs.estimation.moving_modes import Step, carried, displaced_covariance
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.feedback.controller import Telemetry
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_carried_spots import CarriedSpots, CarriedSpotsState, settled_gain
-from nlcwfs.simulation.loop_lenslets import FollowedSpots
-from nlcwfs.simulation.loop_run import LoopTelemetry, loop_bounds, run_loop
-from nlcwfs.simulation.loop_spots_air import coarser
+from nlcwfs.simulation.closed_loop.carried_spots import CarriedSpots, CarriedSpotsState, settled_gain
+from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
+from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, loop_bounds, run_loop
+from nlcwfs.simulation.closed_loop.spots_air import coarser
 
 LENSLETS = ("loop.sensor=shack-hartmann", "shack_hartmann.subapertures=10", "shack_hartmann.pixels=16")
 CARRIED = (*LENSLETS, "feedback.controller=kalman", "loop.learn_after_s=0.2", "loop.seconds=0.4")

@@ -12,10 +12,10 @@ from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.second_look import Looked, SecondLook
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
-from nlcwfs.simulation.loop import GROUPS, Loop
-from nlcwfs.simulation.loop_faults import bump_shape
-from nlcwfs.simulation.loop_measurement import FollowedCurvature
-from nlcwfs.simulation.loop_run import MISSING, LoopTelemetry, loop_bounds, run_loop, summary
+from nlcwfs.simulation.closed_loop.faults import bump_shape
+from nlcwfs.simulation.closed_loop.loop import GROUPS, Loop
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature
+from nlcwfs.simulation.closed_loop.run import MISSING, LoopTelemetry, loop_bounds, run_loop, summary
 
 
 @functools.cache

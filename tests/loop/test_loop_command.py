@@ -22,8 +22,8 @@ from command_line import type_in
 from nlcwfs.commands import loop as command
 from nlcwfs.commands.loop_keeping import Checkpoints
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_run import run_loop
+from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.run import run_loop
 
 
 def typed(out, *words, settings=()):

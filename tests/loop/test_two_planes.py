@@ -8,9 +8,9 @@ import pytest
 
 from nlcwfs.detector.read import Frames
 from nlcwfs.estimation.outcome import Outcome
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature
+from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_measurement import FollowedCurvature
-from nlcwfs.simulation.loop_sight import Sight
 
 
 @pytest.mark.parametrize(("planes", "believed"), [(2, 0), (3, 1), (4, 1)])

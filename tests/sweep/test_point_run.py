@@ -7,9 +7,9 @@ import pytest
 from tests.loop.small_loop import small
 from tests.sweep.small_sweep import written
 
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from, run_loop, summary
-from nlcwfs.simulation.loop_seed import reseeded
+from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, counted_from, run_loop, summary
+from nlcwfs.simulation.closed_loop.seed import reseeded
 from nlcwfs.studies import point_run
 from nlcwfs.studies.point_run import PointRunner
 from nlcwfs.studies.sweep_points import read_sweep

@@ -23,8 +23,8 @@ from nlcwfs.config import Config
 from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import Loop, LoopState, Record
-from nlcwfs.simulation.loop_run import run_loop, summary
+from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
+from nlcwfs.simulation.closed_loop.run import run_loop, summary
 
 CHECKPOINT_EVERY_S = 20.0
 """Time between two checkpoints, in seconds of the computation."""

@@ -11,7 +11,7 @@ from nlcwfs.commands.console import warn
 from nlcwfs.config import Config
 from nlcwfs.errors import FileFormatError
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import LoopState, Record
+from nlcwfs.simulation.closed_loop.loop import LoopState, Record
 
 RESCUED = "nlcwfs-loop-"
 """How the names of folders begin that keep what could not be written where it belongs."""

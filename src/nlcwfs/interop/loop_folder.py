@@ -18,8 +18,8 @@ from nlcwfs.errors import FileFormatError
 from nlcwfs.interop.atomic_write import atomic_write
 from nlcwfs.interop.loop_sensor_aot import aot_sensor
 from nlcwfs.interop.provenance import Provenance
-from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
-from nlcwfs.simulation.loop_run import LoopTelemetry
+from nlcwfs.simulation.closed_loop.loop import GROUPS, Loop, LoopState, Record
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry
 
 CONFIG, SUMMARY, TELEMETRY, RECORDS, IMAGE, CHECKPOINT, PICTURE = (
     "config.toml",

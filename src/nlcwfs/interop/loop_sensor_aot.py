@@ -3,8 +3,8 @@
 import aotpy
 import numpy as np
 
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.loop import Loop
 
 
 def aot_sensor(

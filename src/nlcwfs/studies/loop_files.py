@@ -5,7 +5,7 @@ from typing import Any
 
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import Loop, LoopState, Record
+from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
 from nlcwfs.studies.loop_picture import draw_loop
 
 
@@ -19,7 +19,7 @@ def write_run(
         loop: The loop.
         state: Where it ended.
         records: What was recorded.
-        numbers: See `simulation.loop_run.summary`.
+        numbers: See `simulation.closed_loop.run.summary`.
         stamp: Of all the files.
     """
     folder_of.write_records(folder, loop, records, stamp)

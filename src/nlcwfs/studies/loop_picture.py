@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.interop.atomic_write import atomic_write
-from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
-from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from
+from nlcwfs.simulation.closed_loop.loop import GROUPS, Loop, LoopState, Record
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, counted_from
 
 
 def draw_loop(path: Path, loop: Loop, state: LoopState, records: list[Record], *, floor_nm: float) -> None:

@@ -13,9 +13,9 @@ from nlcwfs.config import Config, digest
 from nlcwfs.errors import NlcwfsError
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
-from nlcwfs.simulation.loop import Loop, LoopState, Record
-from nlcwfs.simulation.loop_run import LoopTelemetry, counted_from, run_loop, summary
-from nlcwfs.simulation.loop_seed import reseeded
+from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, counted_from, run_loop, summary
+from nlcwfs.simulation.closed_loop.seed import reseeded
 from nlcwfs.studies.study_table import Row
 from nlcwfs.studies.sweep_points import Point
 

@@ -11,9 +11,9 @@ from nlcwfs.config import Config
 from nlcwfs.feedback.delay_line import DelayLine
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.science.long_exposure import LongExposure
+from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
-from nlcwfs.simulation.loop_lenslet_light import LensletOptics
-from nlcwfs.simulation.loop_optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
 

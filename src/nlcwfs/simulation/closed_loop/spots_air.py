@@ -12,12 +12,12 @@ from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.config import Config
 from nlcwfs.constants import SEEING_WAVELENGTH_M
 from nlcwfs.feedback.controller import Telemetry
-from nlcwfs.simulation.loop_air import learnt_air, unit_variance_m2
-from nlcwfs.simulation.loop_carried_spots import CarriedSpots, SpotsAir
-from nlcwfs.simulation.loop_flow import AT_LEAST, BEYOND, CELLS
-from nlcwfs.simulation.loop_lenslet_modes import PERIOD, slopes_of_cells, waves_between
-from nlcwfs.simulation.loop_lenslets import FollowedSpots
-from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.closed_loop.air import learnt_air, unit_variance_m2
+from nlcwfs.simulation.closed_loop.carried_spots import CarriedSpots, SpotsAir
+from nlcwfs.simulation.closed_loop.flow import AT_LEAST, BEYOND, CELLS
+from nlcwfs.simulation.closed_loop.lenslet_modes import PERIOD, slopes_of_cells, waves_between
+from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
+from nlcwfs.simulation.closed_loop.light import LoopLight
 
 FINE = 4.0
 """Cells for each cycle of the finest mode, at least, where the air's covariance is computed. Measured, D/d = 36 at 420

@@ -13,10 +13,10 @@ from nlcwfs.estimation.moving_modes import Step
 from nlcwfs.estimation.resolution_level import Measurement
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.feedback.controller import Telemetry
-from nlcwfs.simulation.loop_air import MovingAir, learnt_air, prior_air
-from nlcwfs.simulation.loop_carried import CarriedCurvature
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_measurement import FollowedCurvature
+from nlcwfs.simulation.closed_loop.air import MovingAir, learnt_air, prior_air
+from nlcwfs.simulation.closed_loop.carried import CarriedCurvature
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature
 
 BEYOND = 1.25
 """Modes that are filtered for each that the mirror makes: what is a little finer is carried to it as well."""

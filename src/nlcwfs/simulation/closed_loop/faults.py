@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.settings import LoopSettings
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_settings import LoopSettings
 
 
 def fault_in(settings: LoopSettings, frame: int) -> str:

@@ -5,8 +5,8 @@ import copy
 import equinox as eqx
 
 from nlcwfs.feedback.controller import Controller
-from nlcwfs.simulation.loop import Loop
-from nlcwfs.simulation.loop_light import sequence_config
+from nlcwfs.simulation.closed_loop.light import sequence_config
+from nlcwfs.simulation.closed_loop.loop import Loop
 from nlcwfs.simulation.sequence import SequenceSimulator
 
 

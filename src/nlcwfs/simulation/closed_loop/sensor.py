@@ -6,13 +6,13 @@ from jaxtyping import Array, Bool, Float
 
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
+from nlcwfs.simulation.closed_loop.flow import carried_curvature
+from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature, IdealMeasurement, SingleFrames
+from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_flow import carried_curvature
-from nlcwfs.simulation.loop_lenslet_light import LensletOptics
-from nlcwfs.simulation.loop_lenslets import FollowedSpots
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_measurement import FollowedCurvature, IdealMeasurement, SingleFrames
-from nlcwfs.simulation.loop_sight import Sight
 
 
 @runtime_checkable

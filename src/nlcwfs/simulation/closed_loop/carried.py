@@ -20,9 +20,9 @@ from nlcwfs.estimation.tilt import mean_slope, tilt_phase
 from nlcwfs.estimation.wave_sensitivity import LAGS
 from nlcwfs.estimation.wind import Wind
 from nlcwfs.mirror.mirror import Mirror
+from nlcwfs.simulation.closed_loop.measurement import DOUBTS, SURE, FollowedCurvature, FollowedState
+from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_measurement import DOUBTS, SURE, FollowedCurvature, FollowedState
-from nlcwfs.simulation.loop_sight import Sight
 
 SURPRISING = 2.0
 """An exposure is not believed whose news are so many times the usual: a bump of 300 nm brings three times as much, a

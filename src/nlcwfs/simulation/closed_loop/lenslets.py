@@ -20,11 +20,11 @@ from nlcwfs.estimation.spot_centroids import (
     weighted_centre_of_gravity,
 )
 from nlcwfs.estimation.spot_model import MeanSpot, SpotModel
+from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.lenslet_modes import LensletModes
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure, wavelength_m
-from nlcwfs.simulation.loop_lenslet_light import LensletOptics
-from nlcwfs.simulation.loop_lenslet_modes import LensletModes
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_sight import Sight
 
 HALVED = 0.5
 """While a loop closes, what is left to correct falls at least so far, in square, within `STEADY` exposures."""

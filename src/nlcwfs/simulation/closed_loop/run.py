@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.wind import Wind
 from nlcwfs.feedback.controller import Telemetry
-from nlcwfs.simulation.loop import GROUPS, Loop, LoopState, Record
-from nlcwfs.simulation.loop_light import LoopLight
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.loop import GROUPS, Loop, LoopState, Record
 
 MISSING = -1
 """Outcome of an exposure that did not arrive."""

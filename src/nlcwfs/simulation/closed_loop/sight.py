@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from nlcwfs.config import Config
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.mirror.mirror import Mirror
+from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.exposure import ExposureSimulator
-from nlcwfs.simulation.loop_light import LoopLight
 
 WORTH_FITTING = 0.02
 """Combinations of modes that the pixels show less than this part of the clearest are left alone."""

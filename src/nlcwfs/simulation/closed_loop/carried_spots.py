@@ -16,9 +16,9 @@ from nlcwfs.estimation.moving_modes import Step, left_covariance, settled_covari
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.wind import Wind
 from nlcwfs.mirror.mirror import Mirror
+from nlcwfs.simulation.closed_loop.lenslets import SETTLED, FollowedSpots, SpotsState
+from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_lenslets import SETTLED, FollowedSpots, SpotsState
-from nlcwfs.simulation.loop_sight import Sight
 
 
 class SettledGain(NamedTuple):

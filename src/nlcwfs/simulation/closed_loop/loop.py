@@ -18,15 +18,15 @@ from nlcwfs.feedback.controller import Controller, Telemetry
 from nlcwfs.feedback.state import FeedbackState
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.science.rms_groups import rms_groups
+from nlcwfs.simulation.closed_loop.faults import bump_rms_m, bump_shape, damaged, fault_in
+from nlcwfs.simulation.closed_loop.flow import carried_curvature
+from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature
+from nlcwfs.simulation.closed_loop.sensor import LoopSensor, build_sensor, wind_is_told
+from nlcwfs.simulation.closed_loop.sight import Sight
+from nlcwfs.simulation.closed_loop.spots_air import carried_spots
 from nlcwfs.simulation.exposure import Exposure
-from nlcwfs.simulation.loop_faults import bump_rms_m, bump_shape, damaged, fault_in
-from nlcwfs.simulation.loop_flow import carried_curvature
-from nlcwfs.simulation.loop_lenslets import FollowedSpots
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_measurement import FollowedCurvature
-from nlcwfs.simulation.loop_sensor import LoopSensor, build_sensor, wind_is_told
-from nlcwfs.simulation.loop_sight import Sight
-from nlcwfs.simulation.loop_spots_air import carried_spots
 
 GROUPS = ("tip_tilt", "low", "middle", "high", "beyond")
 """Groups of modes in the order of `Record.group_nm2`: tilt, below 4 cycles per aperture, 4 to 12, above, the rest."""

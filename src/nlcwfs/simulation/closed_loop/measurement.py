@@ -20,10 +20,10 @@ from nlcwfs.estimation.second_look import SecondLook
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
+from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.sight import Cautious, PixelModes, Sight
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.known_sensor import geometry_of
-from nlcwfs.simulation.loop_light import LoopLight
-from nlcwfs.simulation.loop_sight import Cautious, PixelModes, Sight
 
 DOUBTS = 2
 """Frames in a row that are not explained before what was followed is given up."""

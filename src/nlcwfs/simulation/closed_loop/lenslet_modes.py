@@ -14,9 +14,9 @@ from nlcwfs.estimation.loop_reconstructor import LoopModes
 from nlcwfs.estimation.slopes_to_modes import average_gradients
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.mirror.settings import MirrorSettings
+from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
+from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.exposure import wavelength_m
-from nlcwfs.simulation.loop_lenslet_light import LensletOptics
-from nlcwfs.simulation.loop_light import LoopLight
 
 BEYOND = 1.5
 """Waves up to so many times the highest driven frequency are told apart from the driven modes ..."""
