@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
-from nlcwfs.beam.real_products import intensity_behind
+from nlcwfs.beam.real_products import even_and_odd, intensity_behind_even
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.comparison_sensors.settings import PyramidSettings
 from nlcwfs.errors import SamplingError, SettingsError
@@ -46,7 +46,7 @@ class Pyramid(eqx.Module):
 
     Attributes:
         amplitude: Amplitude of the pupil; the squares sum to 1.
-        to_rows: Roof along y, from cells to samples of the images at -y and then +y.
+        to_rows: Roof along y, from cells to samples of the images, for even and odd light, see `beam.real_products`.
         to_columns: The same along x.
         circle_rad: Directions of the star, along y and x.
         y_m: Position of every row of cells.
@@ -71,8 +71,8 @@ class Pyramid(eqx.Module):
     """
 
     amplitude: Float[Array, "y x"]
-    to_rows: Complex[Array, "sample y"]
-    to_columns: Complex[Array, "sample x"]
+    to_rows: Complex[Array, "parity half_v half_y"]
+    to_columns: Complex[Array, "parity half_u half_x"]
     circle_rad: Float[Array, "point 2"]
     y_m: Float[Array, "y 1"]
     x_m: Float[Array, "1 x"]
@@ -120,7 +120,7 @@ class Pyramid(eqx.Module):
         around = Grid((1, settings.read_across * samples), pixel_m / samples).x_m.ravel()
         u_m = np.concatenate([around - shift_m, around + shift_m])
         to_rows, to_columns = (
-            roof(u_m, x_m.ravel(), shift_m=shift_m, cell_m=grid.pixel_m) for x_m in (grid.y_m, grid.x_m)
+            even_and_odd(roof(u_m, x_m.ravel(), shift_m=shift_m, cell_m=grid.pixel_m)) for x_m in (grid.y_m, grid.x_m)
         )
         share = math.sqrt(pixel_m / samples / grid.pixel_m)
         light = np.result_type(dtype, np.complex64)
@@ -151,7 +151,7 @@ class Pyramid(eqx.Module):
         def add(total: Array, direction_rad: Array) -> tuple[Array, None]:
             return total + self._from(opd_m + direction_rad[0] * self.y_m + direction_rad[1] * self.x_m), None
 
-        none = jnp.zeros((self.to_rows.shape[0], self.to_columns.shape[0]), opd_m.dtype)
+        none = jnp.zeros(self._samples, opd_m.dtype)
         total = jax.lax.scan(add, none, self.circle_rad)[0] * (photons / len(self.circle_rad))
         rows, columns = (size // 2 // self.samples for size in total.shape)
         parts = total.reshape(2, rows, self.samples, 2, columns, self.samples).sum((2, 5))
@@ -171,13 +171,17 @@ class Pyramid(eqx.Module):
             raise SettingsError("photons", "must be positive", photons)
         return 1 - jnp.sum(images.photons) / photons
 
+    @property
+    def _samples(self) -> tuple[int, int]:
+        return 2 * self.to_rows.shape[1], 2 * self.to_columns.shape[1]
+
     def _from(self, opd_m: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """Share of the light on each sample, of one direction of the star."""
-        total = jnp.zeros((self.to_rows.shape[0], self.to_columns.shape[0]), opd_m.dtype)
+        total = jnp.zeros(self._samples, opd_m.dtype)
         for wavelength_m, share in zip(self.spectrum.wavelengths_m, self.spectrum.shares, strict=True):
             phase = opd_m * (2 * math.pi / wavelength_m)
             field = jnp.stack([self.amplitude * jnp.cos(phase), self.amplitude * jnp.sin(phase)])
-            total = total + share * intensity_behind(field, self.to_rows, self.to_columns)
+            total = total + share * intensity_behind_even(field, self.to_rows, self.to_columns)
         return total
 
 
