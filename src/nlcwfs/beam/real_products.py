@@ -81,7 +81,9 @@ def _times(field: Float[Array, "part *n row column"], matrix: Complex[Array, "ou
     return jnp.stack([real, product[0, ..., 1, :] + product[1, ..., 0, :]])
 
 
-def _times_even(field: Float[Array, "part *n row column"], pair: Complex[Array, "parity half_out half_column"]) -> Array:
+def _times_even(
+    field: Float[Array, "part *n row column"], pair: Complex[Array, "parity half_out half_column"]
+) -> Array:
     columns, half = field.shape[-1], pair.shape[2]
     right, left = field[..., columns - half :], jnp.flip(field[..., : columns // 2], -1)
     if columns % 2:  # the column in the middle belongs to one side alone
