@@ -1,0 +1,117 @@
+"""What a study of contrast found, in words: for the terminal and for its page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nlcwfs.interop import atomic_write
+from nlcwfs.studies.contrast_table import MAS_RAD, ContrastStudy
+from nlcwfs.studies.study_table import Row
+
+BLIND = "blind"
+
+CAPTION = (
+    "Halo of time lag and photon noise behind an ideal coronagraph, against the angle from the star, for several rates "
+    "of the loop. Dashed: each angle at its best rate. Dotted: without correction. Red: measured in closed loops of "
+    "the simulation, behind an ideal coronagraph."
+)
+
+
+def setting_in_words(study: ContrastStudy) -> str:
+    """Telescope, star and air in a sentence.
+
+    Args:
+        study: What is compared.
+    """
+    halo = study.halo
+    speeds = ", ".join(f"{speed:g}" for _, speed in halo.winds)
+    return (
+        f"{halo.diameter_m:g} m telescope, {halo.photons_per_s:.3g} photons a second at {1e6 * halo.sensing_m:g} um, "
+        f"image at {1e6 * halo.imaging_m:g} um, r0 {100 * halo.air.fried_at(0.5e-6):.1f} cm at 0.5 um, "
+        f"wind {speeds} m/s."
+    )
+
+
+def told_rows(study: ContrastStudy) -> list[list[str]]:
+    """What is told, a list of cells for each line: sensor, what, and a value for each angle."""
+    halo, angle_rad = study.halo, np.array(study.told_mas) * MAS_RAD
+    lines, least = [], []
+    for sensor in study.sensors:
+        factor = study.factor(sensor, np.array(study.told_mas))
+        for rate_hz in study.rates_hz:
+            lines.append([sensor.sensor, f"C2 at {rate_hz:g} Hz", *_cells(halo.contrast(angle_rad, rate_hz, factor))])
+        lines.append([sensor.sensor, "best rate [Hz]", *_cells(halo.best_rate_hz(angle_rad, factor), "{:.0f}")])
+        least.append(halo.best_contrast(angle_rad, factor))
+        lines.append([sensor.sensor, "C2 at the best rate", *_cells(least[-1])])
+    if len(study.sensors) > 1:
+        first, last = study.sensors[0].sensor, study.sensors[-1].sensor
+        gain = np.where(np.isfinite(least[-1]), least[0], np.nan) / np.where(np.isfinite(least[-1]), least[-1], 1)
+        lines.append([last, f"gain over {first}, best rates", *_cells(gain, "{:.3g}")])
+    return lines
+
+
+def answer(study: ContrastStudy) -> str:
+    """The finding in a sentence.
+
+    Args:
+        study: What is compared.
+    """
+    angles = ", ".join(f"{angle:.3g}" for angle in study.told_mas)
+    last = told_rows(study)[-1]
+    if len(study.sensors) == 1:
+        return f"At {angles} mas the {last[0]} sensor leaves a halo of {', '.join(last[2:])} at its best rates"
+    first = study.sensors[0].sensor
+    return (
+        f"At {angles} mas the halo behind the {last[0]} sensor is {', '.join(last[2:])} times fainter than that "
+        f"behind {first}, each at its best rate"
+    )
+
+
+def write_report(path: Path, study: ContrastStudy, picture: str, loops: Sequence[Row]) -> None:
+    """Write the page beside the table.
+
+    Args:
+        path: The page.
+        study: What is compared.
+        picture: File name of the figure.
+        loops: Of the table of loops, if there is one.
+    """
+    lines = [f"# {answer(study)}", ""]
+    lines += ["How bright a halo do time lag and photon noise leave around a bright star, with each sensor?", ""]
+    lines += [setting_in_words(study), "", f"![{CAPTION}]({picture})", "", f"*{CAPTION}*", ""]
+    lines += _table(["sensor", "", *(f"{angle:.3g} mas" for angle in study.told_mas)], told_rows(study))
+    lines += ["", *(f"{line[:1].upper()}{line[1:]}.\n" for line in study.blind())]
+    if loops:
+        lines += ["## In closed loop", "", *_loop_lines(loops), ""]
+    with atomic_write(path) as temporary:
+        temporary.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _loop_lines(loops: Sequence[Row]) -> list[str]:
+    """The loops, and what the closed form says of them."""
+    header = ["sensor", "rate [Hz]", "photons/s", "angle [mas]", "flux factor", "measured", "closed form"]
+    header += ["with the wings", "measured over closed form"]
+    cells = [
+        [
+            *(str(row["sensor"]), f"{row['rate_hz']:g}", f"{row['photons_per_s']:.2g}", f"{row['angle_mas']:g}"),
+            *(f"{row['flux_factor']:.2f}", f"{row['measured']:.2e}", f"{row['contrast']:.2e}"),
+            *(f"{row['with_wings']:.2e}", f"{float(row['measured']) / float(row['contrast']):.2f}"),
+        ]
+        for row in loops
+    ]
+    return [
+        "Coronagraphic images of closed loops of the simulation, means over the azimuth and the run. The flux factor "
+        "is that of the loop's sensor for the wavefront that is left, by Fisher information. The wings are what "
+        "the hard edge of the aperture carries from other angles, above all from beyond the mirror.",
+        "",
+        *_table(header, cells),
+    ]
+
+
+def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *lines)]
+
+
+def _cells(values: np.ndarray, form: str = "{:.2e}") -> list[str]:
+    return [form.format(value) if np.isfinite(value) else BLIND for value in values]
