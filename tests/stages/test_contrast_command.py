@@ -6,6 +6,8 @@ from astropy.table import Table
 from command_line import type_in
 
 from nlcwfs.config import load_config
+from nlcwfs.errors import FileFormatError
+from nlcwfs.interop.sensitivity_table import read_flux_factors
 from nlcwfs.studies.contrast_table import ContrastStudy
 
 PAPER = (
@@ -63,7 +65,9 @@ def test_a_blind_sensor_is_told_in_words(tmp_path):
     assert np.isfinite(table["contrast"]).all()
     assert max(table["angle_mas"][table["sensor"] == "shack-hartmann-12"]) < 6 * 41.3
     page = (tmp_path / "README.md").read_text()
-    assert "| blind | blind |" in page
+    lines = [line for line in page.splitlines() if line.startswith("| shack-hartmann-12")]
+    assert len(lines) == 7  # five rates, the best, and its rate
+    assert all(line.endswith("| blind | blind |") for line in lines)
     assert "nan" not in page + result.output
 
 
@@ -125,6 +129,16 @@ def test_a_table_that_does_not_serve_is_one_line(tmp_path, rows, line):
     assert result.exit_code == 2
     assert line in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+def test_of_several_wavefront_errors_one_is_read(tmp_path):
+    rows = [("curvature", waves, 2.0 + rms, rms) for rms in (0.0, 4.0) for waves in (0.9, 20.0)]
+    names = ("sensor", "cycles_per_aperture", "flux_factor", "rms_rad")
+    Table(rows=rows, names=names).write(tmp_path / "s.ecsv", format="ascii.ecsv")
+    assert read_flux_factors(tmp_path / "s.ecsv")["curvature"].factor.tolist() == [2.0, 2.0]
+    assert read_flux_factors(tmp_path / "s.ecsv", rms_rad=4.0)["curvature"].factor.tolist() == [6.0, 6.0]
+    with pytest.raises(FileFormatError, match="must hold rows with rms_rad = 8, got none"):
+        read_flux_factors(tmp_path / "s.ecsv", rms_rad=8.0)
 
 
 def test_an_infinite_factor_in_a_table_is_blind(tmp_path):

@@ -10,11 +10,18 @@ from nlcwfs.errors import FileFormatError
 from nlcwfs.science.flux_factor import FluxFactor
 
 COLUMNS = ("sensor", "cycles_per_aperture", "flux_factor")
-"""What such a table must have; others are not looked at."""
+"""What such a table must have; others are not looked at, but for `ROUGHNESS`."""
+
+ROUGHNESS = "rms_rad"
+"""Rms of the wavefronts that a row is about, where a table has several."""
 
 
-def read_flux_factors(path: str | Path) -> dict[str, FluxFactor]:
+def read_flux_factors(path: str | Path, *, rms_rad: float = 0.0) -> dict[str, FluxFactor]:
     """The flux factor of each sensor of a table (ECSV), by name; rows may be in any order.
+
+    Args:
+        path: The table.
+        rms_rad: Rms of the wavefronts whose rows are read, where the table has the column.
 
     Raises:
         FileFormatError: If there is no such table, a column is missing, a number is none (infinite is one: blind), or a
@@ -39,6 +46,10 @@ def read_flux_factors(path: str | Path) -> dict[str, FluxFactor]:
     missing = [name for name in COLUMNS if name not in table.colnames]
     if missing:
         raise FileFormatError(f"{path}: must have the columns {', '.join(COLUMNS)}, got no {missing[0]}")
+    if ROUGHNESS in table.colnames:
+        table = table[np.isclose(np.asarray(table[ROUGHNESS], float), rms_rad)]
+        if not len(table):
+            raise FileFormatError(f"{path}: must hold rows with {ROUGHNESS} = {rms_rad:g}, got none")
     points: dict[str, dict[float, float]] = {}
     for number, (name, waves, factor) in enumerate(zip(*(table[name].tolist() for name in COLUMNS), strict=True), 1):
         points.setdefault(str(name), {})

@@ -27,6 +27,9 @@ class ContrastSettings(BaseModel):
         examples=["sensitivity.ecsv"],
         description="table of nlcwfs sensitivity; a sensor that is in it has that flux factor, others a closed form",
     )
+    sensitivity_rms_rad: float = Field(
+        default=0.0, ge=0, description="rms of the wavefronts whose rows of that table are used, as a loop leaves them"
+    )
     curvature_flux_factor: float = Field(
         default=2.1,
         ge=1,

@@ -70,7 +70,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], colors: dict[float, np.ndarray]
 
 
 def _draw_loops(axes: Axes, loops: Sequence[Row]) -> None:
-    """What loops have shown, with the expected scatter of so short a run."""
+    """What loops have shown."""
     for marker, rate_hz in zip("osD^v", sorted({float(row["rate_hz"]) for row in loops}), strict=False):
         shown = [row for row in loops if float(row["rate_hz"]) == rate_hz]
         label = f"loop at {rate_hz:g} Hz"

@@ -63,15 +63,16 @@ def measured_flux_factor(
 ) -> Float[np.ndarray, " wave"]:
     r"""Flux factor of the curvature sensor, for the wavefront that the loop leaves.
 
-    :math:`q = 4 N / F` with the Fisher information F of the amplitude of a wave of unit rms, exact derivatives; the
-    mean information of sines and cosines in `ORIENTATIONS` directions.
+    The Fisher information F of all modes of the mirror (exact derivatives) gives the variance :math:`c^T F^{-1} c` of
+    a wave of unit rms with the coefficients c while all other modes are unknown too; times 4 N it is q. The mean over
+    sines and cosines in `ORIENTATIONS` directions.
 
     Args:
         loop: Has run.
         state: Where it ended.
         cycles_per_aperture: Frequencies.
     """
-    light, still = loop.light, loop.light.still
+    light, still, mirror = loop.light, loop.light.still, loop.light.mirror
     left = light.expose(jnp.asarray(state.frame, jnp.int32), state.control.line, state.image, 0 * light.weights)
     part, weights = light.part, np.asarray(light.weights, float)
 
@@ -81,12 +82,16 @@ def measured_flux_factor(
 
     margins = [(whole - kept) // 2 for whole, kept in zip(still.light.shape, weights.shape, strict=True)]
     inner = tuple(slice(m, m + kept) for m, kept in zip(margins, weights.shape, strict=True))
+    shapes = np.zeros((mirror.count, *mirror.shape), np.float32)
+    shapes[:, np.asarray(mirror.rows), np.asarray(mirror.columns)] = np.asarray(mirror.shapes)
+    information = fisher_information(counts, left.exposure.opd_m[inner], jnp.asarray(shapes))
     radian_m = loop.config.beam.wavelength_um * 1e-6 / (2 * math.pi)
     found = []
     for waves in cycles_per_aperture:
         modes = _waves(part.y_m, part.x_m, weights, float(waves) / still.shape.diameter_m)
-        information = fisher_information(counts, left.exposure.opd_m[inner], jnp.asarray(modes, jnp.float32))
-        found.append(4 / (np.mean(np.diag(information)) * radian_m**2))
+        parts = np.stack([np.asarray(mirror.fitted(jnp.asarray(mode, jnp.float32)), float) for mode in modes])
+        variance = np.sum(parts * np.linalg.solve(information, parts.T).T, axis=1) / np.sum(parts**2, axis=1)
+        found.append(4 * np.mean(variance) / radian_m**2)
     return np.array(found)
 
 

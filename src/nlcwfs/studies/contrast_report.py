@@ -41,7 +41,8 @@ def told_rows(study: ContrastStudy) -> list[list[str]]:
         factor = study.factor(sensor, np.array(study.told_mas))
         for rate_hz in study.rates_hz:
             lines.append([sensor.sensor, f"C2 at {rate_hz:g} Hz", *_cells(halo.contrast(angle_rad, rate_hz, factor))])
-        lines.append([sensor.sensor, "best rate [Hz]", *_cells(halo.best_rate_hz(angle_rad, factor), "{:.0f}")])
+        best_hz = np.where(np.isfinite(factor), halo.best_rate_hz(angle_rad, factor), np.inf)
+        lines.append([sensor.sensor, "best rate [Hz]", *_cells(best_hz, "{:.0f}")])
         least.append(halo.best_contrast(angle_rad, factor))
         lines.append([sensor.sensor, "C2 at the best rate", *_cells(least[-1])])
     if len(study.sensors) > 1:

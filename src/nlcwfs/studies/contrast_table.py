@@ -175,7 +175,8 @@ def flux_factor_of(name: str, config: Config) -> FluxFactor:
         [1.0, 1.0]
     """
     settings = config.contrast
-    tabled = {} if settings.sensitivity_table is None else read_flux_factors(settings.sensitivity_table)
+    path, rms_rad = settings.sensitivity_table, settings.sensitivity_rms_rad
+    tabled = {} if path is None else read_flux_factors(path, rms_rad=rms_rad)
     if name in tabled:
         return tabled[name]
     if name == "shack-hartmann":
