@@ -1,5 +1,6 @@
 """`nlcwfs contrast`: the halo of each sensor against the angle, at several rates and the best; and that of a loop."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from nlcwfs.simulation.closed_loop.loop import LoopState, Record
 from nlcwfs.simulation.closed_loop.run import Watch
 from nlcwfs.studies.contrast_figure import draw_contrast
 from nlcwfs.studies.contrast_loop import loop_rows, run_behind_coronagraph
-from nlcwfs.studies.contrast_report import answer, setting_in_words, told_rows, write_report
+from nlcwfs.studies.contrast_report import answer, over_skies, setting_in_words, told_rows, write_report
 from nlcwfs.studies.contrast_table import ContrastStudy, read_table, write_table
 from nlcwfs.studies.study_table import Row
 
@@ -43,7 +44,7 @@ def contrast(config: Config, out: Path, *, quiet: bool) -> None:
     with undisturbed():
         write_table(out / TABLE, rows, stamp)
         with atomic_write(out / PICTURE) as temporary:
-            draw_contrast(rows, loops).savefig(temporary, dpi=150, format="png")
+            draw_contrast(rows, over_skies(_of_star(study, loops))).savefig(temporary, dpi=150, format="png")
         write_report(out / PAGE, study, PICTURE, loops)
     for line in study.blind():
         warn(line)
@@ -91,6 +92,11 @@ def contrast_of_loop(config: Config, out: Path, *, quiet: bool) -> None:
 
 def _identity(row: Row) -> tuple:
     return tuple(row[name] for name in IDENTITY)
+
+
+def _of_star(study: ContrastStudy, loops: list[Row]) -> list[Row]:
+    """Loops with the photons of the study."""
+    return [row for row in loops if math.isclose(float(row["photons_per_s"]), study.halo.photons_per_s, rel_tol=1e-6)]
 
 
 def _prepare(out: Path) -> None:

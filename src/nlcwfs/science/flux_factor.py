@@ -45,6 +45,7 @@ class FluxFactor(NamedTuple):
         place = np.log(np.clip(asked, least, most))
         points, blind = np.log(self.cycles_per_aperture), np.isinf(self.factor)
         found = np.exp(np.interp(place, points, np.log(np.where(blind, 1.0, np.maximum(self.factor, TINY)))))
+        found = np.where(found > 2 * TINY, found, 0)
         return np.where(np.interp(place, points, blind.astype(float)) > 0, np.inf, found)
 
 

@@ -57,7 +57,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], colors: dict[float, np.ndarray]
     axes.loglog(angle_mas, air, ":", color="0.45", linewidth=1.2, label="not corrected")
     for rate_hz, color in colors.items():
         shown = [row for row in given if float(row["rate_hz"]) == rate_hz]
-        label = f"{rate_hz / 1000:g} kHz" if rate_hz >= 1000 else f"{rate_hz:g} Hz"
+        label = _in_hz(rate_hz)
         axes.loglog(column(shown, "angle_mas"), column(shown, "contrast"), color=color, linewidth=1.5, label=label)
     best = [row for row in rows if row["rate"] == BEST]
     if best:
@@ -73,10 +73,14 @@ def _draw_loops(axes: Axes, loops: Sequence[Row]) -> None:
     """What loops have shown."""
     for marker, rate_hz in zip("osD^v", sorted({float(row["rate_hz"]) for row in loops}), strict=False):
         shown = [row for row in loops if float(row["rate_hz"]) == rate_hz]
-        label = f"loop at {rate_hz:g} Hz"
+        label = f"closed loops at {_in_hz(rate_hz)}"
         axes.loglog(
             column(shown, "angle_mas"), column(shown, "measured"), marker, color="C3", markersize=6, label=label
         )
+
+
+def _in_hz(rate_hz: float) -> str:
+    return f"{rate_hz / 1000:g} kHz" if rate_hz >= 1000 else f"{rate_hz:g} Hz"
 
 
 def _ticks(axes: Axes, angle_mas: np.ndarray, waves: np.ndarray) -> None:

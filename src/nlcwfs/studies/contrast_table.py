@@ -60,7 +60,7 @@ class ContrastStudy(NamedTuple):
         Examples:
             >>> study = ContrastStudy.of(Config.model_validate({"atmosphere": {"photons_per_s": 7.8e7}}))
             >>> [sensor.sensor for sensor in study.sensors], len(study.angles_mas)
-            (['shack-hartmann-18', 'curvature'], 64)
+            (['shack-hartmann-18', 'curvature'], 61)
         """
         settings = config.contrast
         told = tuple(sorted(settings.angles_mas or _octaves(config)))
