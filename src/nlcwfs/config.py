@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from nlcwfs.atmosphere.settings import AtmosphereSettings
 from nlcwfs.beam.settings import BeamSettings
-from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
+from nlcwfs.comparison_sensors.settings import PyramidSettings, ShackHartmannSettings
 from nlcwfs.config_messages import ConfigError, problems_in_words, unknown_key
 from nlcwfs.config_text import commented_toml, plain_toml
 from nlcwfs.curvature_sensor.settings import CurvatureSensorSettings
@@ -67,6 +67,7 @@ class Config(BaseModel):
     feedback: FeedbackSettings = Field(default_factory=FeedbackSettings)
     loop: LoopSettings = Field(default_factory=LoopSettings)
     mirror: MirrorSettings = Field(default_factory=MirrorSettings)
+    pyramid: PyramidSettings = Field(default_factory=PyramidSettings)
     shack_hartmann: ShackHartmannSettings = Field(default_factory=ShackHartmannSettings)
     contrast: ContrastSettings = Field(default_factory=ContrastSettings)
     simulation: SimulationSettings = Field(default_factory=SimulationSettings)

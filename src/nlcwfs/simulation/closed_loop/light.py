@@ -13,6 +13,7 @@ from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
+from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
@@ -72,6 +73,8 @@ class LoopLight(eqx.Module):
         optics = CurvatureOptics(still)
         if config.loop.sensor == "shack-hartmann":
             optics = LensletOptics.build(config, still, weights > 0)
+        if config.loop.sensor == "pyramid":
+            optics = PyramidOptics.build(config, still, part)
         return cls(sequence=sequence, mirror=mirror, weights=jnp.asarray(weights, dtype), optics=optics)
 
     @property

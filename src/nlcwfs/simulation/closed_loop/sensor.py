@@ -11,6 +11,8 @@ from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature, IdealMeasurement, SingleFrames
+from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
+from nlcwfs.simulation.closed_loop.pyramid_sensor import FollowedPyramid
 from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
 
@@ -64,6 +66,8 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         raise SettingsError("feedback.controller", rule, "kalman")
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
+    if isinstance(light.optics, PyramidOptics):
+        return FollowedPyramid.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)
     if method == "map" and loop.follow:

@@ -25,10 +25,10 @@ class LoopSettings(BaseModel):
         le=1000,
         description="Moments of an exposure, evenly spread, whose light is summed while the air moves.",
     )
-    sensor: Literal["curvature", "ideal", "shack-hartmann"] = Field(
+    sensor: Literal["curvature", "ideal", "pyramid", "shack-hartmann"] = Field(
         default="curvature",
         description="What measures: the curvature sensor with the method of [estimation], an ideal sensor that sees "
-        "the mean wavefront without noise, or the lenslets of [shack_hartmann].",
+        "the mean wavefront without noise, the prism of [pyramid], or the lenslets of [shack_hartmann].",
     )
     start: Literal["open", "closed"] = Field(
         default="open", description="Whether the mirror is flat at first, or already has the shape of the air."
@@ -59,7 +59,7 @@ class LoopSettings(BaseModel):
     fault: Literal["none", "nan-frames", "lost-frames", "doubled-frames", "dead-plane", "bump"] = Field(
         default="none",
         description="What goes wrong on purpose: frames of NaN, frames that do not come, old frames again, the first "
-        "plane dark (or a quarter of the spots), or a bump in the wavefront that stays.",
+        "plane dark (or a pupil image, or a quarter of the spots), or a bump in the wavefront that stays.",
     )
     fault_at_s: float = Field(default=0.5, ge=0, description="When it begins.")
     fault_s: float = Field(default=0.05, gt=0, description="How long it lasts.")
