@@ -66,7 +66,7 @@ def test_a_blind_sensor_is_told_in_words(tmp_path):
     assert max(table["angle_mas"][table["sensor"] == "shack-hartmann-12"]) < 6 * 41.3
     page = (tmp_path / "README.md").read_text()
     lines = [line for line in page.splitlines() if line.startswith("| shack-hartmann-12")]
-    assert len(lines) == 7  # five rates, the best, and its rate
+    assert len(lines) == 8  # flux factor, five rates, the best, and its rate
     assert all(line.endswith("| blind | blind |") for line in lines)
     assert "nan" not in page + result.output
 

@@ -30,7 +30,7 @@ def draw_contrast(rows: Sequence[Row], loops: Sequence[Row] = ()) -> Figure:
         >>> row = {"sensor": "ideal", "rate": "given", "rate_hz": 1e3, "cycles_per_aperture": 1.0, "uncorrected": 1e-2}
         >>> rows = [row | {"angle_mas": angle, "contrast": 1e-5} for angle in (41.0, 82.0)]
         >>> draw_contrast(rows).axes[0].get_title()
-        'ideal'
+        'Ideal'
     """
     sensors = list(dict.fromkeys(str(row["sensor"]) for row in rows))
     figure = Figure(figsize=(PANEL_IN * len(sensors) + 0.6, 4.7), layout="constrained")
@@ -40,12 +40,12 @@ def draw_contrast(rows: Sequence[Row], loops: Sequence[Row] = ()) -> Figure:
     for axes, sensor in zip(panels, sensors, strict=True):
         _draw_panel(axes, [row for row in rows if row["sensor"] == sensor], colors)
         _draw_loops(axes, [row for row in loops if row["sensor"] == sensor])
-        axes.set_title(sensor, fontsize=11)
+        axes.set_title(_title(sensor), fontsize=11)
     panels[0].set_ylabel("contrast $C_2$: mean halo over the star's peak")
     values = column(rows, "contrast")
     panels[0].set_ylim(10 ** np.floor(np.log10(values.min()) - 0.1), 20 * values.max())
     shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=5, fontsize=8.5, frameon=False)
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
     return figure
 
 
@@ -77,6 +77,11 @@ def _draw_loops(axes: Axes, loops: Sequence[Row]) -> None:
         axes.loglog(
             column(shown, "angle_mas"), column(shown, "measured"), marker, color="C3", markersize=6, label=label
         )
+
+
+def _title(sensor: str) -> str:
+    across = sensor.removeprefix("shack-hartmann-")
+    return sensor[:1].upper() + sensor[1:] if across == sensor else f"Shack-Hartmann, $D/d$ = {across}"
 
 
 def _in_hz(rate_hz: float) -> str:

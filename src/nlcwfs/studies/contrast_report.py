@@ -39,6 +39,7 @@ def told_rows(study: ContrastStudy) -> list[list[str]]:
     lines, least = [], []
     for sensor in study.sensors:
         factor = study.factor(sensor, np.array(study.told_mas))
+        lines.append([sensor.sensor, "flux factor", *_cells(factor, "{:.3g}")])
         for rate_hz in study.rates_hz:
             lines.append([sensor.sensor, f"C2 at {rate_hz:g} Hz", *_cells(halo.contrast(angle_rad, rate_hz, factor))])
         best_hz = np.where(np.isfinite(factor), halo.best_rate_hz(angle_rad, factor), np.inf)
@@ -142,4 +143,4 @@ def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _cells(values: np.ndarray, form: str = "{:.2e}") -> list[str]:
-    return [form.format(value) if np.isfinite(value) else BLIND for value in values]
+    return [form.format(value).replace("e-0", "e-") if np.isfinite(value) else BLIND for value in values]
