@@ -1,6 +1,7 @@
 """The figure of a study of contrast: the halo against the angle, a panel for each sensor (Guyon 2010, Fig. 12)."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import matplotlib
 import numpy as np
@@ -94,7 +95,7 @@ def _ticks(axes: Axes, angle_mas: np.ndarray, waves: np.ndarray) -> None:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     scale = float(waves[0] / angle_mas[0])
-    above = axes.secondary_xaxis("top", functions=(lambda x: x * scale, lambda x: x / scale))
+    above = axes.secondary_xaxis("top", functions=(partial(np.multiply, scale), partial(np.multiply, 1 / scale)))
     above.set_xlabel("cycles per aperture", fontsize=9)
     above.xaxis.set_major_locator(FixedLocator(list(WAVE_TICKS)))
     above.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
