@@ -71,13 +71,13 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], colors: dict[float, np.ndarray]
 
 
 def _draw_loops(axes: Axes, loops: Sequence[Row]) -> None:
-    """What loops have shown."""
+    """What loops have shown, and the closed form with their own flux factor."""
     for marker, rate_hz in zip("osD^v", sorted({float(row["rate_hz"]) for row in loops}), strict=False):
         shown = [row for row in loops if float(row["rate_hz"]) == rate_hz]
-        label = f"closed loops at {_in_hz(rate_hz)}"
-        axes.loglog(
-            column(shown, "angle_mas"), column(shown, "measured"), marker, color="C3", markersize=6, label=label
-        )
+        angle_mas, name = column(shown, "angle_mas"), f"closed loops at {_in_hz(rate_hz)}"
+        style = {"linestyle": "", "marker": marker, "color": "C3", "markersize": 6}
+        axes.plot(angle_mas, column(shown, "measured"), **style, label=name)
+        axes.plot(angle_mas, column(shown, "contrast"), **style, fillstyle="none", label=f"closed form of {name}")
 
 
 def _title(sensor: str) -> str:

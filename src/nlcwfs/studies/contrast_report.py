@@ -14,7 +14,7 @@ BLIND = "blind"
 CAPTION = (
     "Halo of time lag and photon noise behind an ideal coronagraph, against the angle from the star, for several rates "
     "of the loop. Dashed: each angle at its best rate. Dotted: without correction. Red: measured in closed loops of "
-    "the simulation, behind an ideal coronagraph."
+    "the simulation, behind an ideal coronagraph; open: the closed form with the flux factor of the sensor in these loops."
 )
 
 
@@ -106,10 +106,17 @@ def _loop_lines(loops: Sequence[Row]) -> list[str]:
     return [
         "Coronagraphic images of closed loops of the simulation, means over the azimuth and the run. The flux factor "
         "is that of the loop's sensor for the wavefront that is left, by Fisher information. The wings are what "
-        "the hard edge of the aperture carries from other angles, above all from beyond the mirror.",
+        "the hard edge of the aperture carries from other angles, above all from beyond the mirror."
+        + _no_static(loops),
         "",
         *_table(header, cells),
     ]
+
+
+def _no_static(loops: Sequence[Row]) -> str:
+    if any(float(row["static_nm"]) for row in loops):
+        return ""
+    return " No static aberration is in the arm of the sensor: slow waves need more photons than they do with one."
 
 
 def over_skies(loops: Sequence[Row]) -> list[Row]:
