@@ -46,7 +46,7 @@ def draw_contrast(rows: Sequence[Row], loops: Sequence[Row] = ()) -> Figure:
     values = column(rows, "contrast")
     panels[0].set_ylim(10 ** np.floor(np.log10(values.min()) - 0.1), 20 * values.max())
     shown = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=5, fontsize=8.5, frameon=False)
     return figure
 
 
@@ -64,7 +64,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], colors: dict[float, np.ndarray]
     if best:
         best_mas, least = column(best, "angle_mas"), column(best, "contrast")
         axes.loglog(best_mas, least, "--", color="black", linewidth=1.2, label="best rate of each angle")
-    axes.set_xlim(angle_mas.min() / 1.02, angle_mas.max() * 1.02)
+    axes.set_xlim(angle_mas.min() / 1.05, angle_mas.max() * 1.05)
     axes.set_xlabel("angle from the star [mas]")
     _ticks(axes, angle_mas, column(first, "cycles_per_aperture"))
     axes.grid(alpha=0.3)
@@ -77,7 +77,7 @@ def _draw_loops(axes: Axes, loops: Sequence[Row]) -> None:
         angle_mas, name = column(shown, "angle_mas"), f"closed loops at {_in_hz(rate_hz)}"
         style = {"linestyle": "", "marker": marker, "color": "C3", "markersize": 6}
         axes.plot(angle_mas, column(shown, "measured"), **style, label=name)
-        axes.plot(angle_mas, column(shown, "contrast"), **style, fillstyle="none", label=f"closed form of {name}")
+        axes.plot(angle_mas, column(shown, "contrast"), **style, fillstyle="none", label="closed form of these loops")
 
 
 def _title(sensor: str) -> str:
