@@ -14,7 +14,8 @@ BLIND = "blind"
 CAPTION = (
     "Halo of time lag and photon noise behind an ideal coronagraph, against the angle from the star, for several rates "
     "of the loop. Dashed: each angle at its best rate. Dotted: without correction. Red: measured in closed loops of "
-    "the simulation, behind an ideal coronagraph; open: the closed form with the flux factor of the sensor in these loops."
+    "the simulation, behind an ideal coronagraph; open: the closed form with the flux factor of "
+    "the sensor in these loops."
 )
 
 
