@@ -15,6 +15,7 @@ STUDIES = (
     "04-faint-stars",
     "05-fewer-planes",
     "06-sensitivity",
+    "07-contrast",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 

@@ -216,6 +216,31 @@ def sweep(
 
 @app.command()
 @mendable
+def contrast(
+    config: ConfigArgument = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of table, figure and page; made if it is not there.")
+    ] = Path("contrast"),
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Measure it: run the loop of [loop] behind an ideal coronagraph.")
+    ] = False,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Predict the halo around a star: contrast C2 of lag and photon noise, by angle, rate and sensor.
+
+    Tells the best rate of each angle, and the gain of the last sensor over the first. What --loop has put into the same
+    folder is drawn beside it.
+    """
+    from nlcwfs.commands.contrast import contrast as predict
+    from nlcwfs.commands.contrast import contrast_of_loop as measure
+    from nlcwfs.config import load_config
+
+    (measure if loop else predict)(load_config(config, settings or []), out, quiet=quiet)
+
+
+@app.command()
+@mendable
 def sensitivity(
     study: Annotated[
         Path | None,

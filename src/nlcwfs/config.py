@@ -25,6 +25,7 @@ from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.feedback.settings import FeedbackSettings
 from nlcwfs.mirror.settings import MirrorSettings
+from nlcwfs.science.settings import ContrastSettings
 from nlcwfs.simulation.closed_loop.settings import LoopSettings
 from nlcwfs.simulation.settings import SimulationSettings
 
@@ -68,6 +69,7 @@ class Config(BaseModel):
     mirror: MirrorSettings = Field(default_factory=MirrorSettings)
     pyramid: PyramidSettings = Field(default_factory=PyramidSettings)
     shack_hartmann: ShackHartmannSettings = Field(default_factory=ShackHartmannSettings)
+    contrast: ContrastSettings = Field(default_factory=ContrastSettings)
     simulation: SimulationSettings = Field(default_factory=SimulationSettings)
 
     @model_validator(mode="after")

@@ -87,12 +87,13 @@ class LoopLight(eqx.Module):
         """The part of the light's grid that holds the pupil."""
         return Grid((self.weights.shape[0], self.weights.shape[1]), self.still.light.pixel_m)
 
-    def star_image(self, wavelength_m: float) -> LongExposure:
+    def star_image(self, wavelength_m: float, *, coronagraph: bool = False) -> LongExposure:
         """An image to which nothing has been added yet."""
         still = self.still
         angles = Grid((IMAGE_PIXELS, IMAGE_PIXELS), wavelength_m / still.shape.diameter_m / 2)
         pupil = _middle(still.shape.on(still.light), self.weights.shape)
-        return LongExposure.init(pupil, wavelength_m=wavelength_m, pixel_m=still.light.pixel_m, angles=angles)
+        scale = {"wavelength_m": wavelength_m, "pixel_m": still.light.pixel_m, "angles": angles}
+        return LongExposure.init(pupil, **scale, coronagraph=coronagraph)
 
     def air_m(self, frame: int) -> Float[Array, "lit_y lit_x"]:
         """The wavefront of the air in the middle of an exposure, without piston."""
