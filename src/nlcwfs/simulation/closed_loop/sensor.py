@@ -10,6 +10,7 @@ from nlcwfs.simulation.closed_loop.flow import carried_curvature
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
 from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.linear_images import handed_over
 from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature, IdealMeasurement, SingleFrames
 from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
@@ -66,6 +67,8 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         return FollowedSpots.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)
+    if loop.sensor == "linear-curvature" or loop.handover:
+        return handed_over(config, light)
     if method == "map" and loop.follow:
         followed = FollowedCurvature.build(config, light)
         return (wind_is_told(config) and carried_curvature(followed, config, light, None)) or followed
