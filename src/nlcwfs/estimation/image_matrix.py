@@ -29,7 +29,7 @@ BENT = 0.5
 """The linear range ends where the estimate is off the linear one by more than this part of it: a loop still shrinks
 such a residual, but not a much larger one."""
 
-LEAST_CHI2 = 2.0
+LEAST_CHI2 = 1.5
 """Below so much chi-square no estimate is doubted: normalised differences hardly let it grow."""
 
 DRAW = 53
@@ -197,7 +197,7 @@ def linear_range(
         >>> sizes = np.array([1e-8, 2e-8, 4e-8])
         >>> found = linear_range(sizes, np.array([0.3, 0.4, 0.6]), np.array([1.0, 1.2, 2.2]), np.ones(3))
         >>> round(1e9 * found.limit_m, 1), round(found.limit_chi2, 1)
-        (30.0, 2.0)
+        (30.0, 1.7)
     """
     useful, told = missed <= BENT, tuple(tuple(map(float, one)) for one in (rms_m, missed, chi2, size))
     if not useful.any():

@@ -6,7 +6,7 @@ some frames in a row, the matrix of the closed loop takes over; it hands back wh
 """
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ STEADY = 2
 """Frames in a row without such a fall after which a loop with matrices alone counts as closed."""
 
 
+@runtime_checkable
 class Capture(Protocol):
     """What works while the linear model does not hold; see `LoopSensor`."""
 
@@ -103,10 +104,6 @@ class MatrixLook(eqx.Module):
         reach = self.matrix.range
         return not look.dark and look.chi2 < reach.limit_chi2 and look.size_m < reach.limit_m
 
-    def holds_well(self, look: Look) -> bool:
-        """The same with a margin, so that a loop that has just handed over does not hand back."""
-        return self.holds(look) and look.chi2**2 < self.matrix.range.limit_chi2
-
     @eqx.filter_jit
     def _looked(self, electrons: Array, usable: Array) -> tuple[Array, Array, Array, Array]:
         modes_m = self.matrix.modes_m(electrons, usable)
@@ -147,7 +144,7 @@ class HandedOver(eqx.Module):
                 return self._sight(look, outcome), state._replace(doubts=doubts)
             state = HandedState(None, False, 0, 0)
         sight, captured = self.capture.measure(exposure, usable, mirror_m, state.captured)
-        good = state.good + 1 if self.linear.holds_well(look) and sight.closed and sight.outcome.succeeded else 0
+        good = state.good + 1 if holds and sight.closed and sight.outcome.succeeded else 0
         if good >= SURE:
             return sight, HandedState(None, True, 0, 0)
         return sight, HandedState(captured, False, good, 0)

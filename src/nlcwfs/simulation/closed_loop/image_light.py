@@ -21,8 +21,9 @@ from nlcwfs.simulation.closed_loop.loop_waves import LoopWaves
 from nlcwfs.simulation.exposure import distances_m, wavelength_m
 from nlcwfs.simulation.known_sensor import geometry_of
 
-CELLS = 2
-"""Cells of the model along a detector pixel, if the light's own can be put together so; the light itself has more."""
+AT_LEAST = 64
+"""Cells of the model across the pupil, if the light's cells can be put together so. With 32 the rim alone adds 0.28 to
+a chi-square of 1 (2 m, 16 pixels), with 64 0.06."""
 
 
 class ImageLight(eqx.Module):
@@ -60,11 +61,12 @@ class ImageLight(eqx.Module):
             SettingsError: If settings contradict each other.
         """
         still, lit = light.still, np.asarray(light.weights) > 0
-        coarser = still.factor // CELLS if still.factor % CELLS == 0 else 1
+        across = still.shape.diameter_m / still.light.pixel_m
+        parts = (part for part in range(still.factor, 1, -1) if still.factor % part == 0)
+        coarser = next((part for part in parts if across / part >= AT_LEAST * (1 - 1e-9)), 1)
         size = math.ceil(still.light.shape[0] / coarser)
-        if coarser > 1:
-            while size % 2 or size != scipy.fft.next_fast_len(size):
-                size += 1
+        while (size * coarser - lit.shape[0]) % 2 or size != scipy.fft.next_fast_len(size):
+            size += 1
         grid = Grid((size, size), still.light.pixel_m * coarser)
         sensor = geometry_of(config, still).model(grid, dtype=str(light.weights.dtype))
         rows, columns = np.nonzero(lit)

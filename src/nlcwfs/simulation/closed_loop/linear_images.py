@@ -133,7 +133,8 @@ def handed_over(config: Config, light: LoopLight) -> HandedOver:
     loop, told_m = config.loop, np.asarray(light.reference_m, float)[np.asarray(light.weights) > 0]
     if loop.sensor == "linear-curvature":
         images = LinearImages.build(config, light)
-        return HandedOver(OpenMatrix(images.matrix(told_m, closed=False)), within_range(images, told_m))
+        closed = within_range(images, told_m)
+        return HandedOver(OpenMatrix(images.matrix(told_m, closed=False)), closed)
     if loop.sensor != "curvature" or config.estimation.method != "map" or not loop.follow:
         rule = "needs loop.sensor = curvature with estimation.method = map and loop.follow"
         raise SettingsError("loop.handover", rule, "true")

@@ -63,12 +63,12 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     if config.feedback.controller == "kalman" and not carries:
         rule = "filters the air of loop.sensor = shack-hartmann, or of curvature with method = map and loop.follow"
         raise SettingsError("feedback.controller", rule, "kalman")
+    if loop.sensor == "linear-curvature" or loop.handover:
+        return handed_over(config, light)
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)
-    if loop.sensor == "linear-curvature" or loop.handover:
-        return handed_over(config, light)
     if method == "map" and loop.follow:
         followed = FollowedCurvature.build(config, light)
         return (wind_is_told(config) and carried_curvature(followed, config, light, None)) or followed
