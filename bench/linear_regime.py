@@ -1,4 +1,4 @@
-"""The linear regime: does the matrix take over, hold as well as the method that captured, hand back, and how fast is it.
+"""The linear regime: does the matrix take over, leave as little as what captured, hand back; how fast is it.
 
     python bench/linear_regime.py small                     20 tries of 2 m (settings of tests/loop, scaled planes)
     python bench/linear_regime.py small --set loop.fault=bump --set loop.bump_nm=400 --set loop.fault_at_s=0.1
@@ -92,9 +92,8 @@ def timed(loop: Loop, repeats: int = 60) -> None:
     sensor, config = loop.measurement, loop.config
     if not isinstance(sensor, HandedOver) or not isinstance(sensor.capture, FollowedCurvature):
         raise SystemExit("needs a loop that hands over")
-    loop.config = config.model_copy(
-        update={"loop": config.loop.model_copy(update={"seconds": 12 / config.loop.rate_hz})}
-    )
+    short = config.loop.model_copy(update={"seconds": 12 / config.loop.rate_hz})
+    loop.config = config.model_copy(update={"loop": short})
     state, _ = run_loop(loop)
     shot = loop.light.expose(
         jnp.asarray(state.frame, jnp.int32), state.control.line, state.image, jnp.zeros_like(loop.light.weights)

@@ -148,7 +148,7 @@ def image_matrix(
     made = loop_reconstructor(known, noise_rad2=noise, closed=closed)
     forward, weight = linear.interaction[:, :driven], 1 / noise
 
-    def tried(coefficients_m: np.ndarray, seed: int) -> tuple[float, float, float, float]:
+    def tried(coefficients_m: np.ndarray, seed: int) -> tuple[float, ...]:
         """Chi-square; squares of what the estimate is off, of the linear one and of the estimate."""
         images = np.maximum(left.images(coefficients_m, seed), 0)
         modes_m = made.matrix @ (np.asarray(signals(images.astype(dtype)), float) - linear.signal)
@@ -199,12 +199,13 @@ def linear_range(
         >>> round(1e9 * found.limit_m, 1), round(found.limit_chi2, 1)
         (30.0, 1.7)
     """
-    useful, told = missed <= BENT, tuple(tuple(map(float, one)) for one in (rms_m, missed, chi2, size))
+    useful = missed <= BENT
     if not useful.any():
-        return LinearRange(*told, 0.0, 0.0)
+        return LinearRange(tuple(rms_m), tuple(missed), tuple(chi2), tuple(size), 0.0, 0.0)
     last = int(np.flatnonzero(useful)[-1])
     limit_m = float(rms_m[last])
     if last + 1 < len(rms_m):
         part = (BENT - missed[last]) / (missed[last + 1] - missed[last])
         limit_m += float(part * (rms_m[last + 1] - rms_m[last]))
-    return LinearRange(*told, limit_m, max(LEAST_CHI2, float(np.interp(limit_m, rms_m, chi2))))
+    limit_chi2 = max(LEAST_CHI2, float(np.interp(limit_m, rms_m, chi2)))
+    return LinearRange(tuple(rms_m), tuple(missed), tuple(chi2), tuple(size), limit_m, limit_chi2)

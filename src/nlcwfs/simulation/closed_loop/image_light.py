@@ -80,7 +80,7 @@ class ImageLight(eqx.Module):
             shape=(size * coarser, size * coarser),
             coarser=coarser,
             factor=still.factor // coarser,
-            window=still.window,
+            window=(still.window[0], still.window[1]),
         )
 
     def __call__(self, values_m: Float[Array, " lit"]) -> Float[Array, "plane v u"]:
