@@ -151,8 +151,14 @@ def test_a_run_tells_which_estimator_worked(tmp_path):
         (("loop.handover=true", "loop.sensor=ideal"), r"loop\.handover: needs loop\.sensor = curvature with"),
         (("loop.handover=true", "loop.follow=false"), r"loop\.handover: needs loop\.sensor = curvature with"),
         (("loop.handover=true", "feedback.controller=kalman"), r"loop\.handover: must be false with"),
-        (("linear_curvature.distances_km=[-1000, 900]",), "distances_km must be pairs"),
-        ((*HANDED, "loop.reference_nm=[0, 0, 9000]"), r"loop\.reference_nm: must have a linear range beyond the .* nm"),
+        (
+            ("linear_curvature.distances_km=[-1000, 900]",),
+            r"linear_curvature\.distances_km: must be pairs, one plane at \+z",
+        ),
+        (
+            (*HANDED, "loop.reference_nm=[0, 0, 9000]"),
+            r"loop\.reference_nm: must have a linear range of .* nm, 3 times",
+        ),
     ],
 )
 def test_settings_that_cannot_be(overrides, rule):

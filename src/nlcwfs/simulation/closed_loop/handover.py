@@ -26,6 +26,9 @@ DOUBTS = 2
 HALVED = 0.5
 """While an open loop closes, what is left to correct falls at least so far, in square, within `STEADY` frames."""
 
+LOST = 2.0
+"""The last matrix is given up for the first when more is left to correct than so many times what it is made for."""
+
 STEADY = 2
 """Frames in a row without such a fall after which a loop with matrices alone counts as closed."""
 
@@ -102,7 +105,7 @@ class MatrixLook(eqx.Module):
     def holds(self, look: Look) -> bool:
         """Whether the linear model explains an exposure, and what it finds is within its range."""
         reach = self.matrix.range
-        return not look.dark and look.chi2 < reach.limit_chi2 and look.size_m < reach.limit_m
+        return reach.serves and not look.dark and look.chi2 < reach.limit_chi2 and look.size_m < reach.limit_m
 
     @eqx.filter_jit
     def _looked(self, electrons: Array, usable: Array) -> tuple[Array, Array, Array, Array]:
@@ -167,16 +170,22 @@ class OpenState(NamedTuple):
     Attributes:
         least_m2: The least that was ever left to correct, in square.
         steady: Exposures in a row in which it was not halved.
+        stage: Matrix in use.
     """
 
     least_m2: float
     steady: int
+    stage: int
 
 
 class OpenMatrix(eqx.Module):
-    """Captures with a matrix that is made for all of the turbulence, and believes every exposure with light."""
+    """Captures with matrices: for all of the turbulence, then for what that one leaves; believes all light.
 
-    matrix: MatrixLook
+    Attributes:
+        stages: The matrices.
+    """
+
+    stages: tuple[MatrixLook, ...]
 
     def measure(
         self,
@@ -186,15 +195,20 @@ class OpenMatrix(eqx.Module):
         memory: OpenState | None,
     ) -> tuple[Sight, OpenState]:
         """What an exposure shows; see `LoopSensor`."""
-        state = memory or OpenState(math.inf, 0)
-        look = self.matrix.look(exposure.frames.electrons, usable)
+        state = memory or OpenState(math.inf, 0, 0)
+        stage = self.stages[state.stage]
+        look = stage.look(exposure.frames.electrons, usable)
         if look.dark:
             return Sight(jnp.zeros_like(look.residual_m), Outcome.NO_LIGHT, math.nan, 0, False), state
         left_m2 = look.size_m**2
         steady = 0 if left_m2 < HALVED * state.least_m2 else state.steady + 1
-        predicted_m = self.matrix.matrix.predicted_m
-        sight = Sight(look.residual_m, Outcome.CONVERGED, predicted_m, 0, steady >= STEADY)
-        return sight, OpenState(min(left_m2, state.least_m2), steady)
+        sight = Sight(look.residual_m, Outcome.CONVERGED, stage.matrix.predicted_m, 0, False)
+        if steady < STEADY:
+            return sight, OpenState(min(left_m2, state.least_m2), steady, state.stage)
+        if state.stage + 1 < len(self.stages):
+            return sight, OpenState(math.inf, 0, state.stage + 1)
+        far = left_m2 > (LOST * stage.matrix.range.rms_m[0]) ** 2
+        return sight._replace(closed=True), OpenState(math.inf, 0, 0) if far else state._replace(steady=steady)
 
     def skip(self, memory: OpenState | None) -> tuple[None, OpenState | None]:
         """Nothing changes; see `LoopSensor`."""

@@ -107,7 +107,8 @@ class ImageLight(eqx.Module):
             waves: Its modes.
             driven_m2: Variance of what is left of the driven ones; those beyond are the air's.
         """
-        grid = Grid((self.coherence.shape[1],) * 2, self.sensor.pixel_m)
+        size = self.coherence.shape[1]
+        grid = Grid((size, size), self.sensor.pixel_m)
         frequency, wave_m = half_plane_frequencies(grid), wavelength_m(config)
         apart_m = [wave_m * abs(z_m) * frequency for z_m in distances_m(config)]
         table_m = np.linspace(0, float(np.max(apart_m)), 600)

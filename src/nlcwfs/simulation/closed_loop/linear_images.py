@@ -67,14 +67,21 @@ class LinearImages(eqx.Module):
         """Of an exposure."""
         return self.light.still.photons * self.config.detector.quantum_efficiency
 
-    def left_m2(self, *, closed: bool) -> Float[np.ndarray, " driven"]:
-        """Variance of the driven modes, all of the air or about what a loop leaves."""
-        open_m2 = self.waves.open_m2[: self.waves.driven]
-        if not closed:
-            return open_m2
+    @property
+    def open_m2(self) -> Float[np.ndarray, " driven"]:
+        """Variance of the driven modes in the air."""
+        return self.waves.open_m2[: self.waves.driven]
+
+    @property
+    def closed_m2(self) -> Float[np.ndarray, " driven"]:
+        """About what a loop leaves of them."""
         radian_m = wavelength_m(self.config) / (2 * math.pi)
         noise_m2 = SPECKLED_LOSS / (4 * self.electrons) * radian_m**2
-        return np.minimum(open_m2, LAGGING * self.waves.moved_m2 + noise_m2)
+        return np.minimum(self.open_m2, LAGGING * self.waves.moved_m2 + noise_m2)
+
+    def left_by(self, before: MatrixLook) -> Float[np.ndarray, " driven"]:
+        """What an exposure finds after the command of a matrix."""
+        return np.minimum(self.open_m2, np.asarray(before.matrix.error_m2) + self.waves.moved_m2)
 
     @eqx.filter_jit
     def _exposed(self, start_m: Array, modes_m: Array, finer_m: Array) -> Float[Array, "plane v u"]:
@@ -90,14 +97,17 @@ class LinearImages(eqx.Module):
         drawn = np.fft.irfft2(np.fft.rfft2(white) * np.sqrt(power) / grid.pixel_m, s=grid.shape)
         return drawn[np.asarray(self.light.weights) > 0]
 
-    def matrix(self, reference_m: Float[np.ndarray, " lit"], *, closed: bool) -> MatrixLook:
+    def matrix(
+        self, reference_m: Float[np.ndarray, " lit"], driven_m2: Float[np.ndarray, " driven"], *, closed: bool
+    ) -> MatrixLook:
         """The matrix around a reference wavefront.
 
         Args:
             reference_m: On the lit cells.
-            closed: For what a loop leaves, or for all of the turbulence.
+            driven_m2: Variance of the driven modes of the residuals for which it is made.
+            closed: Whether their prior is what the loop settles to, or this.
         """
-        light, waves, driven_m2 = self.light, self.waves, self.left_m2(closed=closed)
+        light, waves = self.light, self.waves
         blurred = self.sharp.amid(self.config, light, waves, driven_m2)
         start = jnp.asarray(reference_m, self.shapes.dtype)
         read_variance = light.still.detector.variance_without_light
@@ -114,7 +124,8 @@ class LinearImages(eqx.Module):
             return np.asarray(self._exposed(start, jnp.asarray(modes_m, start.dtype), finer_m), float)
 
         left = Residuals(images, read_variance, str(start.dtype))
-        known = LoopModes(linear.interaction, waves.open_m2, waves.moved_m2)
+        prior_m2 = waves.open_m2 if closed else np.concatenate([driven_m2, waves.open_m2[waves.driven :]])
+        known = LoopModes(linear.interaction, prior_m2, waves.moved_m2)
         made = image_matrix(signal, linear, known, left, closed=closed)
         to_command = waves.commands(np.eye(waves.driven))
         lit = np.asarray(light.weights) > 0
@@ -134,7 +145,9 @@ def handed_over(config: Config, light: LoopLight) -> HandedOver:
     if loop.sensor == "linear-curvature":
         images = LinearImages.build(config, light)
         closed = within_range(images, told_m)
-        return HandedOver(OpenMatrix(images.matrix(told_m, closed=False)), closed)
+        first = images.matrix(told_m, images.open_m2, closed=False)
+        second = images.matrix(told_m, images.left_by(first), closed=False)
+        return HandedOver(OpenMatrix((first, second)), closed)
     if loop.sensor != "curvature" or config.estimation.method != "map" or not loop.follow:
         rule = "needs loop.sensor = curvature with estimation.method = map and loop.follow"
         raise SettingsError("loop.handover", rule, "true")
@@ -149,10 +162,11 @@ def within_range(images: LinearImages, reference_m: Float[np.ndarray, " lit"]) -
     Raises:
         SettingsError: If around the reference the linear range is smaller than what the loop leaves.
     """
-    made = images.matrix(reference_m, closed=True)
-    limit_nm, left_nm = 1e9 * made.matrix.range.limit_m, 1e9 * made.matrix.range.rms_m[0]
-    if np.any(reference_m) and limit_nm <= left_nm:
-        rule = f"must have a linear range beyond the {left_nm:.0f} nm that the loop leaves; it has {limit_nm:.0f} nm"
+    made = images.matrix(reference_m, images.closed_m2, closed=True)
+    reach = made.matrix.range
+    if np.any(reference_m) and not reach.serves:
+        left_nm, limit_nm = 1e9 * MARGIN * reach.rms_m[0], 1e9 * reach.limit_m
+        rule = f"must have a linear range of {left_nm:.0f} nm, {MARGIN:g} times what the loop leaves; it has {limit_nm:.0f} nm"
         weights = np.asarray(images.light.weights, float)[np.asarray(images.light.weights) > 0]
         rms_nm = 1e9 * math.sqrt(np.sum(weights * reference_m**2))
         raise SettingsError("loop.reference_nm", rule, f"{rms_nm:.0f} nm rms")
