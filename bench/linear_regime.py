@@ -129,6 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("size", choices=sorted(SIZES))
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--time", action="store_true")
     parser.add_argument("--out", type=Path, default=None)
@@ -139,7 +140,7 @@ def main() -> None:
         timed(loops[0])
         return
     rows = []
-    for seed in range(given.seeds):
+    for seed in range(given.first, given.first + given.seeds):
         rows.append(compared(*(reseeded(loop, seed) for loop in loops)))
         print(rows[-1], flush=True)
         if given.out is not None:

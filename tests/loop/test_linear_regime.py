@@ -153,11 +153,11 @@ def test_a_run_tells_which_estimator_worked(tmp_path):
         (("loop.handover=true", "feedback.controller=kalman"), r"loop\.handover: must be false with"),
         (
             ("linear_curvature.distances_km=[-1000, 900]",),
-            r"linear_curvature\.distances_km: must be pairs, one plane at \+z",
+            r"linear_curvature\.distances_km: must be pairs",
         ),
         (
             (*HANDED, "loop.reference_nm=[0, 0, 9000]"),
-            r"loop\.reference_nm: must have a linear range of .* nm, 3 times",
+            r"loop\.reference_nm: must have a linear range of .* nm",
         ),
     ],
 )

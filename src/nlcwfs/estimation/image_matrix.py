@@ -30,8 +30,8 @@ BENT = 0.5
 such a residual, but not a much larger one."""
 
 MARGIN = 3.0
-"""A linear range serves that is so many times what the loop leaves. Measured (`bench/linear_regime.py`): with 4.0 (2 m) and
-4.7 (8 m, 3e7 photons at 1 kHz) a loop stays; with 2.1 (8 m, 1.2e4 photons at 260 Hz) it crept away to 240 nm."""
+"""A linear range serves that is so many times what the loop leaves. Measured (`bench/linear_regime.py`): with 4.0 (2 m)
+and 4.7 (8 m, 3e7 photons at 1 kHz) a loop stays; with 2.1 (8 m, 3e6 photons at 260 Hz) it crept away to 240 nm."""
 
 LEAST_CHI2 = 1.5
 """Below so much chi-square no estimate is doubted: normalised differences hardly let it grow."""

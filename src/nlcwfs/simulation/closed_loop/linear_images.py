@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
-from nlcwfs.estimation.image_matrix import Residuals, image_matrix
+from nlcwfs.estimation.image_matrix import MARGIN, Residuals, image_matrix
 from nlcwfs.estimation.image_signals import NormalisedCounts, NormalisedDifferences
 from nlcwfs.estimation.interaction_matrix import linearised
 from nlcwfs.estimation.loop_reconstructor import LoopModes
@@ -166,7 +166,7 @@ def within_range(images: LinearImages, reference_m: Float[np.ndarray, " lit"]) -
     reach = made.matrix.range
     if np.any(reference_m) and not reach.serves:
         left_nm, limit_nm = 1e9 * MARGIN * reach.rms_m[0], 1e9 * reach.limit_m
-        rule = f"must have a linear range of {left_nm:.0f} nm, {MARGIN:g} times what the loop leaves; it has {limit_nm:.0f} nm"
+        rule = f"must have a linear range of {left_nm:.0f} nm ({MARGIN:g} times what is left); it has {limit_nm:.0f} nm"
         weights = np.asarray(images.light.weights, float)[np.asarray(images.light.weights) > 0]
         rms_nm = 1e9 * math.sqrt(np.sum(weights * reference_m**2))
         raise SettingsError("loop.reference_nm", rule, f"{rms_nm:.0f} nm rms")
