@@ -176,7 +176,6 @@ def image_matrix(
         found.append(np.mean(one, axis=0))
     chi2, off_m2, linear_m2, size_m2 = np.array(found).T
     driven_m = np.array(FACTORS) * np.sqrt(np.sum(driven_m2))
-    reach = linear_range(driven_m, np.sqrt(off_m2 / linear_m2), chi2 / chi2[0], np.sqrt(size_m2) / driven_m)
     return ImageMatrix(
         signal=signal,
         reference=jnp.asarray(linear.signal, dtype),
@@ -186,7 +185,7 @@ def image_matrix(
         expected_chi2=float(chi2[0]),
         predicted_m=float(np.sqrt(np.sum(made.error_m2))),
         error_m2=made.error_m2,
-        range=reach,
+        range=linear_range(driven_m, np.sqrt(off_m2 / linear_m2), chi2 / chi2[0], np.sqrt(size_m2) / driven_m),
     )
 
 
