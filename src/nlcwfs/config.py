@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from nlcwfs.atmosphere.settings import AtmosphereSettings
 from nlcwfs.beam.settings import BeamSettings
-from nlcwfs.comparison_sensors.settings import PyramidSettings, ShackHartmannSettings
+from nlcwfs.comparison_sensors.settings import LinearCurvatureSettings, PyramidSettings, ShackHartmannSettings
 from nlcwfs.config_messages import ConfigError, problems_in_words, unknown_key
 from nlcwfs.config_text import commented_toml, plain_toml
 from nlcwfs.curvature_sensor.settings import CurvatureSensorSettings
@@ -65,6 +65,7 @@ class Config(BaseModel):
     detector: DetectorSettings = Field(default_factory=DetectorSettings)
     estimation: EstimationSettings = Field(default_factory=EstimationSettings)
     feedback: FeedbackSettings = Field(default_factory=FeedbackSettings)
+    linear_curvature: LinearCurvatureSettings = Field(default_factory=LinearCurvatureSettings)
     loop: LoopSettings = Field(default_factory=LoopSettings)
     mirror: MirrorSettings = Field(default_factory=MirrorSettings)
     pyramid: PyramidSettings = Field(default_factory=PyramidSettings)

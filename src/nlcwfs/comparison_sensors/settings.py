@@ -1,7 +1,7 @@
-"""What a user may choose about the rivals of the curvature sensor."""
+"""What a user may choose about the sensors that ours is compared with."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -141,3 +141,29 @@ class PyramidSettings(BaseModel):
     def read_across(self) -> int:
         """Pixels along a side of the square that is read around a pupil image."""
         return self.pixels + 2 * self.margin_pixels
+
+
+class LinearCurvatureSettings(BaseModel):
+    """The planes of a curvature sensor that is read by a matrix alone, near enough to the pupil to be linear.
+
+    Examples:
+        >>> LinearCurvatureSettings(distances_km=(-2000, -800, 800, 2000)).distances_km  # dual stroke
+        (-2000.0, -800.0, 800.0, 2000.0)
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    distances_km: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
+        default=(-1000.0, 1000.0),
+        min_length=2,
+        examples=[(-2000.0, -800.0, 800.0, 2000.0)],
+        description="where the planes lie, in pairs at +z and -z; two pairs are a dual stroke",
+    )
+
+    @model_validator(mode="after")
+    def _planes_are_pairs(self) -> "LinearCurvatureSettings":
+        planes = sorted(self.distances_km)
+        pairs = planes == sorted(-distance for distance in planes) and 0 not in planes
+        if not pairs or len(set(planes)) < len(planes):
+            raise ValueError("distances_km must be pairs, one plane at +z for each at -z")
+        return self

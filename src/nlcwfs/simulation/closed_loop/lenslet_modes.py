@@ -1,27 +1,16 @@
 """What the lenslets of a loop see of its mirror's modes, and of the waves beyond them."""
 
-import math
-
 import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float
 
-from nlcwfs.beam.modes import KOLMOGOROV_SPECTRUM
 from nlcwfs.config import Config
 from nlcwfs.estimation.loop_reconstructor import LoopModes
 from nlcwfs.estimation.slopes_to_modes import average_gradients
-from nlcwfs.simulation.closed_loop.driven_modes import DrivenModes, strength_m2
+from nlcwfs.simulation.closed_loop.driven_modes import DrivenModes
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.light import LoopLight
-
-BEYOND = 1.5
-"""Waves up to so many times the highest driven frequency are told apart from the driven modes ..."""
-
-MOST_BEYOND = 8.0
-"""... but not more than so many cycles per aperture above it: their number grows with the square."""
-
-PERIOD = 1.2
-"""Of the series of waves, in diameters of the telescope; at 1 they would repeat at opposite rims."""
+from nlcwfs.simulation.closed_loop.loop_waves import loop_waves
 
 
 class LensletModes:
@@ -43,22 +32,9 @@ class LensletModes:
             SettingsError: If no mode is slow enough to be driven.
         """
         cutoff = config.shack_hartmann.cutoff_cpa or config.shack_hartmann.subapertures / 2
-        drive = DrivenModes.build(config, light, cutoff_cpa=cutoff, setting="shack_hartmann.cutoff_cpa")
-        cycles = np.asarray(drive.modes.cycles_per_aperture, float)
+        waves = loop_waves(config, light, cutoff_cpa=cutoff, setting="shack_hartmann.cutoff_cpa")
         gradients = slopes_of_cells(optics, np.asarray(light.weights) > 0)
-        shapes = np.asarray(drive.modes.shapes, float)
-        seen, open_m2 = [gradients @ shapes.T], [drive.open_m2]
-        fastest = cycles[drive.driven - 1]
-        waves, frequency = waves_between(cycles[-1], min(BEYOND * fastest, fastest + MOST_BEYOND), light)
-        if len(frequency):
-            fit = np.asarray(drive.modes.fit, float)
-            seen.append(gradients @ (waves - shapes.T @ (fit @ waves)))  # what the mirror's modes do not hold
-            strength = strength_m2(config, light)
-            open_m2.append(KOLMOGOROV_SPECTRUM * frequency ** (-11 / 3) * strength * 2 / PERIOD**2)
-        known = LoopModes(
-            interaction=np.concatenate(seen, axis=1), open_m2=np.concatenate(open_m2), moved_m2=drive.moved_m2
-        )
-        return cls(known, drive)
+        return cls(LoopModes(gradients @ waves.shapes.T, waves.open_m2, waves.moved_m2), waves.drive)
 
     @property
     def count(self) -> int:
@@ -93,19 +69,3 @@ def slopes_of_cells(optics: LensletOptics, lit: Bool[np.ndarray, "lit_y lit_x"])
     ones = np.ones(nearest.size)
     continued = scipy.sparse.csr_array((ones, (np.arange(nearest.size), nearest)), shape=(nearest.size, lit.sum()))
     return scipy.sparse.csr_array(of_part @ continued)
-
-
-def waves_between(
-    lowest: float, highest: float, light: LoopLight
-) -> tuple[Float[np.ndarray, "lit wave"], Float[np.ndarray, " wave"]]:
-    """Cosines and sines of a Fourier series on the lit cells, and the cycles per aperture of each."""
-    most = math.ceil(highest * PERIOD)
-    fy, fx = (axis.ravel() / PERIOD for axis in np.mgrid[0 : most + 1, -most : most + 1])
-    frequency = np.hypot(fy, fx)
-    half = ((fy > 0) | (fx > 0)) & (frequency > lowest) & (frequency <= highest)
-    fy, fx, frequency = fy[half], fx[half], frequency[half]
-    grid = light.part
-    y, x = np.broadcast_arrays(grid.y_m / light.still.shape.diameter_m, grid.x_m / light.still.shape.diameter_m)
-    lit = np.asarray(light.weights) > 0
-    angle = 2 * np.pi * (y[lit][:, None] * fy + x[lit][:, None] * fx)
-    return np.concatenate([np.cos(angle), np.sin(angle)], axis=1), np.concatenate([frequency, frequency])
