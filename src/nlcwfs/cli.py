@@ -214,6 +214,35 @@ def sweep(
     raise typer.Exit(run(study, SweepOptions(out, workers, scheduler, wait, quiet)))
 
 
+@app.command()
+@mendable
+def design(
+    config: ConfigArgument = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the design; made if not there.")] = Path("design"),
+    planes: Annotated[int, typer.Option(help="How many planes, 2 or 4, in symmetric pairs.")] = 4,
+    window: Annotated[float, typer.Option(help="Width of the detector's window in telescope diameters.")] = 1.45,
+    pixels: Annotated[int | None, typer.Option(help="Pixels across the pupil; default 2.75 for each cycle.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Exposures in a second; default: the best.")] = None,
+    rms_nm: Annotated[float | None, typer.Option("--rms-nm", help="What may be left; told when impossible.")] = None,
+    keep_planes: Annotated[bool, typer.Option("--keep-planes", help="Judge the planes that are set.")] = False,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Design a sensor: planes, light split, pixels, window and rate for a telescope, star, air and mirror.
+
+    Two or three minutes. Writes settings ready for nlcwfs loop, a table and a figure, and tells what rms to expect.
+    Ends with 2 when a requirement cannot be met.
+    """
+    from nlcwfs.commands.design import design as run
+    from nlcwfs.config import load_config
+    from nlcwfs.simulation.design.requirements import Wishes
+
+    wishes = Wishes(planes, window, pixels, rate, rms_nm, keep_planes)
+    chosen = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
+    raise typer.Exit(run(load_config(config, chosen), wishes, out, quiet=quiet))
+
+
 def main() -> None:
     """Entry point of the command `nlcwfs`."""
     try:
