@@ -27,6 +27,10 @@ def draw_design(found: Design) -> Figure:
     distance.axhline(1e9 * found.errors.quantum_m, color="0.5", lw=1, ls=":", label="quantum limit")
     for number, one in enumerate(found.planes.distances_m):
         distance.axvline(one / 1e3, color="C1", lw=0.8, ls="--", label=None if number else "its planes")
+    ticks = [one * ten for ten in (1, 10, 100, 1000, 10000) for one in (1, 2, 3, 5)]
+    shown = [tick for tick in ticks if away_km.min() * 0.9 < tick < away_km.max() * 1.1]
+    distance.set_xticks(shown, [f"{tick:g}" for tick in shown])
+    distance.minorticks_off()
     distance.set(xlabel="distance on either side [km]", ylabel="left by the photons [nm rms]")
     _errors(rate, [one.rate_hz for one in found.rates], found.rates)
     rate.set(xscale="log", xlabel="exposures a second", ylabel="expected [nm rms]", ylim=(0, None))

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from nlcwfs.errors import SettingsError
 
-SAME = 0.02
-r"""Signal below which a wave counts as not shown, over the largest, :math:`\sqrt{\sum w \sin^2}`: one in 2500 of the
-information of speckled light, which no star makes up for."""
+FAINT = 0.05
+r"""Signal below which a wave counts as not shown, over the largest, :math:`\sqrt{\sum w \sin^2}`: one in 400 of the
+photons tell of it."""
 
 
 def flat_signal(
@@ -70,4 +70,4 @@ def blind_frequencies(
     orders = np.arange(1, int(wavelength_m * nearest_m * (up_to / diameter_m) ** 2) + 1)
     cycles = diameter_m * np.sqrt(orders / (wavelength_m * nearest_m))
     signal = flat_signal(cycles, away_m, wavelength_m=wavelength_m, diameter_m=diameter_m)
-    return [float(one) for one in cycles[signal < SAME]]
+    return [float(one) for one in cycles[signal < FAINT]]

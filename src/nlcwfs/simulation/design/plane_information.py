@@ -22,7 +22,7 @@ from nlcwfs.simulation.design.loop_residual import LoopResidual
 
 PLACES_PER_CELL, PLACES_PER_SPECKLE = 1.3, 3.5
 """Places at which the light is looked up, along a cell of the pupil and along a speckle, lambda z / D: the coarser of
-both is enough. Half as many again change the error by less than 1 %."""
+both is enough. Four times as many make the photons' rms 0.5 to 1 % larger, that of near planes and far ones alike."""
 
 AT_A_TIME = 8
 """Modes that travel together: what fits into the cache."""
@@ -82,11 +82,13 @@ class PlaneInformation:
         residual: The wavefronts that are met.
         pixels: The pixels of an image.
         dark_share: Variance of a pixel without light over the photons of a plane.
+        places_per_cell: See `PLACES_PER_CELL`.
     """
 
     residual: LoopResidual
     pixels: Pixels
     dark_share: float = 0.0
+    places_per_cell: float = PLACES_PER_CELL
     _known: dict[float, list[Float[np.ndarray, "mode mode"]]] = field(default_factory=dict, repr=False)
     _caught: dict[float, float] = field(default_factory=dict, repr=False)
 
@@ -112,7 +114,7 @@ class PlaneInformation:
         grid, pixels = residual.grid, self.pixels
         loop = residual.loop
         speckle_m = loop.wavelength_m * distance_m / loop.diameter_m
-        wide_m = max(grid.pixel_m / PLACES_PER_CELL, speckle_m / PLACES_PER_SPECKLE)
+        wide_m = max(grid.pixel_m / self.places_per_cell, speckle_m / PLACES_PER_SPECKLE)
         pixel_m = loop.diameter_m / pixels.across
         per_pixel = math.ceil(pixel_m / wide_m)
         places = Grid((1, per_pixel * pixels.window), pixel_m / per_pixel)
@@ -137,7 +139,7 @@ def _information(
     modes: Float[Array, "mode y x"],
     near: Complex[Array, "y x"],
     travel: Complex[Array, "u x"],
-    dark_share: float,
+    dark_share: float | Float[Array, ""],
     *,
     window: int,
 ) -> tuple[Float[Array, "mode mode"], Float[Array, ""]]:
@@ -152,7 +154,7 @@ def _information(
     sharpness = jnp.where(seen, 1 / jnp.sqrt(jnp.where(seen, mean + dark_share, 1)), 0)
 
     def signal(mode: Float[Array, "y x"]) -> Float[Array, " pixel"]:
-        change = travel @ (1j * mode * near) @ travel.T
+        change = travel @ (mode.astype(near.dtype) * (1j * near)) @ travel.T
         return (on_pixels(2 * jnp.real(jnp.conj(far) * change)) * sharpness).reshape(-1)
 
     signals = jax.lax.map(signal, modes, batch_size=AT_A_TIME)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -40,7 +39,7 @@ class Wishes:
         4
     """
 
-    planes: Literal[2, 4] = 4
+    planes: int = 4
     window: float = 1.45
     pixels: int | None = None
     rate_hz: float | None = None
@@ -107,10 +106,13 @@ def _check_locked(residual: LoopResidual, wishes: Wishes, rate_hz: float) -> Non
         bright = dataclasses.replace(residual, loop=brighter)
         return ideal_errors(bright, rate_hz=first_rate_hz(bright, wishes), loss=USUAL_LOSS).total_m
 
-    enough = next((factor for factor in np.geomspace(1.1, 1e6, 146) if left_m(factor) <= most_m), None)
-    if enough is None:
+    low, enough = 1.0, 1e6
+    if left_m(enough) > most_m:
         parts = f"mirror {1e9 * expected.fitting_m:.0f} nm, lag {1e9 * expected.lag_m:.0f} nm at {rate_hz:g} Hz"
         raise SettingsError("mirror.cutoff_cpa", f"mirror and rate must leave less than {limit}", parts)
+    while enough > 1.05 * low:
+        middle = math.sqrt(low * enough)
+        low, enough = (low, middle) if left_m(middle) <= most_m else (middle, enough)
     rule = f"must be at least {photons_per_s * enough:.2g} (photo-electrons) to leave less than {limit}"
     raise SettingsError(
         "atmosphere.photons_per_s", rule, f"{photons_per_s:.2g}, which leave {1e9 * expected.total_m:.0f} nm"
