@@ -1,7 +1,9 @@
 """`nlcwfs design`: propose planes, pixels and rate, and write them down ready for the loop."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import astropy.units as u
 from astropy.table import Table
 from rich.console import Console
 
@@ -12,6 +14,7 @@ from nlcwfs.interop import Provenance, atomic_write
 from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.design.design import Design
 from nlcwfs.simulation.design.design import design as propose
+from nlcwfs.simulation.design.loop_errors import LoopErrors
 from nlcwfs.simulation.design.requirements import Wishes
 
 SETTINGS, TABLE, FIGURE = "design.toml", "design.ecsv", "design.png"
@@ -78,7 +81,9 @@ def rows(found: Design) -> list[dict[str, str | float | int]]:
     detector = found.config.detector
     across, window = detector.pixels_across_pupil, detector.window_pixels
 
-    def row(kind: str, planes, errors, across=across, window=window):
+    def row(
+        kind: str, planes: Sequence[float], errors: LoopErrors, across: int = across, window: int = window
+    ) -> dict[str, str | float | int]:
         return {
             "kind": kind,
             "distances_km": " ".join(f"{one / 1e3:g}" for one in planes),
@@ -108,10 +113,9 @@ def _write(found: Design, out: Path, stamp: Provenance) -> None:
 
     with atomic_write(out / SETTINGS) as temporary:
         temporary.write_text(to_toml(found.config), encoding="utf-8")
-    table = Table(rows=rows(found), meta={"provenance": stamp.as_dict()})
-    for name in table.colnames:
-        if name.endswith("_nm"):
-            table[name].unit = "nm"
+    told = rows(found)
+    units = {name: u.nm for name in told[0] if name.endswith("_nm")}
+    table = Table(rows=told, units=units, meta={"provenance": stamp.as_dict()})
     with atomic_write(out / TABLE) as temporary:
         table.write(temporary, format="ascii.ecsv")
     figure = draw_design(found)

@@ -179,10 +179,10 @@ def best_of_rates(left_m: Callable[[float], float]) -> float:
     found = scipy.optimize.minimize_scalar(
         lambda log_hz: left_m(math.exp(log_hz)), bounds=(low, high), method="bounded", options={"xatol": 0.02}
     )
-    return float(f"{math.exp(found.x):.2g}")
+    return float(f"{math.exp(found['x']):.2g}")
 
 
 def _summed(information: PlaneInformation, planes: Planes) -> list[Float[np.ndarray, "mode mode"]]:
     pairs = [information.of_pair(distance_m) for distance_m in planes.distances_m]
-    weighted = zip(zip(*pairs, strict=True), strict=True)
-    return [sum(share * one for share, one in zip(planes.shares, draw, strict=True)) for (draw,) in weighted]
+    shares = np.array(planes.shares)
+    return [np.tensordot(shares, np.stack(draw), axes=1) for draw in zip(*pairs, strict=True)]
