@@ -39,10 +39,11 @@ def search_planes(
     def left_m(distances_m: Sequence[float]) -> float:
         return loop_errors(information, Planes.evenly(*distances_m), rate_hz=rate_hz).photon_m
 
-    for number, share in enumerate(COARSE):
-        tell(f"planes at {share * unit_m / 1e3:.0f} km, {number + 1} of {len(COARSE)}")
-        information.of_pair(share * unit_m)
-    best = min(_sets([share * unit_m for share in COARSE], pairs), key=left_m)
+    coarse_m = [_rounded(share * unit_m) for share in COARSE]
+    for number, distance_m in enumerate(coarse_m):
+        tell(f"planes at {distance_m / 1e3:.0f} km, {number + 1} of {len(coarse_m)}")
+        information.of_pair(distance_m)
+    best = min((one for one in itertools.combinations(coarse_m, pairs) if _apart(one)), key=left_m)
     for factor in FINER:
         tell(f"planes near {' and '.join(f'{one / 1e3:.0f}' for one in best)} km")
         around = [[_rounded(one / factor), one, _rounded(one * factor)] for one in best]
@@ -50,11 +51,6 @@ def search_planes(
         best = min(candidates, key=left_m)
     best = tuple(sorted(best))
     return Planes(best, _split(information, best, rate_hz)) if pairs == 2 else Planes.evenly(*best)
-
-
-def _sets(distances_m: Sequence[float], pairs: int) -> list[tuple[float, ...]]:
-    rounded = [_rounded(distance_m) for distance_m in distances_m]
-    return [one for one in itertools.combinations(rounded, pairs) if _apart(one)]
 
 
 def _apart(distances_m: Sequence[float]) -> bool:
