@@ -16,6 +16,7 @@ STUDIES = (
     "05-fewer-planes",
     "06-sensitivity",
     "07-contrast",
+    "08-planes-and-pixels",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 

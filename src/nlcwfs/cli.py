@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from nlcwfs.commands.console import INTERRUPTED, mendable
+from nlcwfs.commands.options import ConfigArgument, QuietOption, SeedOption, SetOption
 from nlcwfs.errors import SettingsError
 
 app = typer.Typer(
@@ -24,16 +25,6 @@ app = typer.Typer(
     epilog="Exit codes: 0 done; 1 done, but a wavefront is not to be believed (written and flagged); 2 something "
     "that you can mend, told in one line; 130 interrupted, what was done is kept.",
 )
-
-ConfigArgument = Annotated[
-    Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Settings; what it leaves out is default.")
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, such as beam.diameter_m=6.5; repeatable."),
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
-SeedOption = Annotated[int | None, typer.Option(help="Which sky and noise; the same seed, the same numbers.")]
 
 
 @app.command()
@@ -265,6 +256,35 @@ def sensitivity(
 
     typed = tuple(rms_rad or ()), tuple(cpa or ()), tuple(sensor or ()), tuple(settings or ())
     raise typer.Exit(run(SensitivityOptions(study, out, *typed, quiet)))
+
+
+@app.command()
+@mendable
+def design(
+    config: ConfigArgument = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the design; made if not there.")] = Path("design"),
+    planes: Annotated[int, typer.Option(help="How many planes, 2 or 4, in symmetric pairs.")] = 4,
+    window: Annotated[float, typer.Option(help="Width of the detector's window in telescope diameters.")] = 1.45,
+    pixels: Annotated[int | None, typer.Option(help="Pixels across the pupil; default 2.75 for each cycle.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Exposures in a second; default: the best.")] = None,
+    rms_nm: Annotated[float | None, typer.Option("--rms-nm", help="What may be left; told when impossible.")] = None,
+    keep_planes: Annotated[bool, typer.Option("--keep-planes", help="Judge the planes that are set.")] = False,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Design a sensor: planes, light split, pixels, window and rate for a telescope, star, air and mirror.
+
+    Two or three minutes. Writes settings ready for nlcwfs loop, a table and a figure, and tells what rms to expect.
+    Ends with 2 when a requirement cannot be met.
+    """
+    from nlcwfs.commands.design import design as run
+    from nlcwfs.config import load_config
+    from nlcwfs.simulation.design.requirements import Wishes
+
+    wishes = Wishes(planes, window, pixels, rate, rms_nm, keep_planes)
+    chosen = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
+    raise typer.Exit(run(load_config(config, chosen), wishes, out, quiet=quiet))
 
 
 def main() -> None:

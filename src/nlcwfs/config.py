@@ -18,7 +18,7 @@ from nlcwfs.beam.settings import BeamSettings
 from nlcwfs.comparison_sensors.settings import LinearCurvatureSettings, PyramidSettings, ShackHartmannSettings
 from nlcwfs.config_messages import ConfigError, problems_in_words, unknown_key
 from nlcwfs.config_text import commented_toml, plain_toml
-from nlcwfs.curvature_sensor.settings import CurvatureSensorSettings
+from nlcwfs.curvature_sensor.settings import FARTHEST_KM, CurvatureSensorSettings
 from nlcwfs.detector.presets import IDEAL
 from nlcwfs.detector.settings import DetectorSettings
 from nlcwfs.errors import FileFormatError, SettingsError
@@ -75,8 +75,40 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _sections_agree(self) -> "Config":
+        object.__setattr__(self, "curvature_sensor", placed(self.curvature_sensor, self.beam))
         cross_checks(self)
         return self
+
+
+def placed(sensor: CurvatureSensorSettings, beam: BeamSettings) -> CurvatureSensorSettings:
+    r"""The same sensor with distances in place of waves of defocus, so that all else knows distances only.
+
+    A lens that adds defocus of w waves, peak to valley over a pupil of diameter D, images at the focus what a plane at
+    :math:`D^2 / (8 \lambda w)` shows without it (see `docs/design.md`).
+
+    Raises:
+        SettingsError: If a plane would be farther than any may be.
+
+    Examples:
+        >>> beam = BeamSettings()
+        >>> sensor = placed(CurvatureSensorSettings(defocus_waves=(-2.5, 5.0)), beam)
+        >>> [round(distance_km) for distance_km in sensor.distances_km]
+        [-3765, 1882]
+    """
+    if sensor.defocus_waves is None:
+        return sensor
+    waves = sensor.defocus_waves
+    distances_km = tuple(beam.diameter_m**2 / (8e-6 * beam.wavelength_um * one) / 1e3 for one in waves)
+    if max(map(abs, distances_km)) > FARTHEST_KM:
+        least = beam.diameter_m**2 / (8e-6 * beam.wavelength_um * FARTHEST_KM * 1e3)
+        rule = f"must be at least {least:.2g} to either side, a plane at {FARTHEST_KM:g} km"
+        raise SettingsError("curvature_sensor.defocus_waves", rule, list(waves))
+    return CurvatureSensorSettings(
+        distances_km=distances_km,
+        flux_fractions=sensor.flux_fractions,
+        static_rms_nm=sensor.static_rms_nm,
+        static_seed=sensor.static_seed,
+    )
 
 
 def cross_checks(config: Config) -> None:

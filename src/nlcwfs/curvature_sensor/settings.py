@@ -1,8 +1,12 @@
 """What a user may choose about the optics of the sensor."""
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+
+FARTHEST_KM = 1e6
+"""Farthest distance of a plane to either side."""
 
 
 class CurvatureSensorSettings(BaseModel):
@@ -10,10 +14,17 @@ class CurvatureSensorSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    distances_km: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
+    distances_km: tuple[Annotated[float, Field(ge=-FARTHEST_KM, le=FARTHEST_KM)], ...] = Field(
         default=(-3500.0, -2500.0, 2500.0, 3500.0),
         min_length=1,
         description="where the planes lie, at the scale of the telescope; positive is downstream of the pupil",
+    )
+    defocus_waves: tuple[Annotated[float, Field(ge=-1e4, le=1e4)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        examples=[(-2.0, 2.0)],
+        description="instead of distances_km, phase diversity: defocus of each image of the star, waves from peak to "
+        "valley over the pupil; the sign is that of the distance, which is D^2 / (8 wavelength waves)",
     )
     flux_fractions: tuple[float, ...] | None = Field(
         default=None,
@@ -27,14 +38,27 @@ class CurvatureSensorSettings(BaseModel):
 
     @model_validator(mode="after")
     def _planes_agree(self) -> "CurvatureSensorSettings":
-        if len(set(self.distances_km)) < len(self.distances_km):
-            raise ValueError("distances_km must differ from each other")
-        if all(distance == 0 for distance in self.distances_km):
+        if self.defocus_waves is not None and "distances_km" in self.model_fields_set:
+            raise ValueError("defocus_waves must be left out with distances_km: they say the same in other words")
+        name = "distances_km" if self.defocus_waves is None else "defocus_waves"
+        places = self.distances_km if self.defocus_waves is None else self.defocus_waves
+        if len(set(places)) < len(places):
+            raise ValueError(f"{name} must differ from each other")
+        if self.defocus_waves is not None and 0 in self.defocus_waves:
+            raise ValueError("defocus_waves must not be 0: an image in focus is at no distance")
+        if all(place == 0 for place in places):
             raise ValueError("distances_km must hold a plane out of the pupil: one at 0 does not see the phase")
         if self.flux_fractions is None:
             return self
-        if len(self.flux_fractions) != len(self.distances_km):
+        if len(self.flux_fractions) != len(places):
             raise ValueError("flux_fractions must be one per plane")
         if min(self.flux_fractions) <= 0 or abs(sum(self.flux_fractions) - 1) > 1e-6:
             raise ValueError("flux_fractions must be positive and sum to 1")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_waves_that_are_not_set(
+        self, write: Callable[["CurvatureSensorSettings"], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """Keep the fingerprint of settings as it was before there was this key."""
+        return {name: value for name, value in write(self).items() if name != "defocus_waves" or value is not None}

@@ -1,0 +1,75 @@
+"""The search for the planes: coarse distances, then finer ones around the best, then the split of the light."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import scipy.optimize
+
+from nlcwfs.simulation.design.loop_errors import Planes, loop_errors
+from nlcwfs.simulation.design.plane_information import PlaneInformation
+
+COARSE = (0.004, 0.0075, 0.014, 0.021, 0.031, 0.0465, 0.07, 0.11)
+"""Distances that are tried first, in units of D^2 / lambda: 0.3 to 8.3 thousand km for 8 m at 0.85 um. 3500 km are
+0.0465; farther ones are told beside, see `design`."""
+
+FINER = (1.25, 1.1)
+"""Factors by which distances are then moved to and fro."""
+
+LEAST_RATIO = 1.15
+"""Of the distances of two pairs: nearer to each other they tell the same."""
+
+Tell = Callable[[str], None]
+
+
+def search_planes(
+    information: PlaneInformation, *, pairs: int, rate_hz: float, tell: Tell = lambda line: None
+) -> Planes:
+    """Symmetric pairs that leave the least error of the mirror's modes.
+
+    Args:
+        information: Of planes on pixels.
+        pairs: One or two.
+        rate_hz: Exposures in a second.
+        tell: Called with what is being done.
+    """
+    loop = information.residual.loop
+    unit_m = loop.diameter_m**2 / loop.wavelength_m
+
+    def left_m(distances_m: Sequence[float]) -> float:
+        return loop_errors(information, Planes.evenly(*distances_m), rate_hz=rate_hz).photon_m
+
+    coarse_m = [_rounded(share * unit_m) for share in COARSE]
+    for number, distance_m in enumerate(coarse_m):
+        tell(f"planes at {distance_m / 1e3:.0f} km, {number + 1} of {len(coarse_m)}")
+        information.of_pair(distance_m)
+    best = min((one for one in itertools.combinations(coarse_m, pairs) if _apart(one)), key=left_m)
+    for factor in FINER:
+        tell(f"planes near {' and '.join(f'{one / 1e3:.0f}' for one in best)} km")
+        around = [[_rounded(one / factor), one, _rounded(one * factor)] for one in best]
+        candidates = [tuple(one) for one in itertools.product(*around) if _apart(one)]
+        best = min(candidates, key=left_m)
+    best = tuple(sorted(best))
+    return Planes(best, _split(information, best, rate_hz)) if pairs == 2 else Planes.evenly(*best)
+
+
+def _apart(distances_m: Sequence[float]) -> bool:
+    ordered = sorted(distances_m)
+    return all(far >= LEAST_RATIO * near for near, far in itertools.pairwise(ordered))
+
+
+def _rounded(distance_m: float) -> float:
+    """Two digits and a half: nobody places a detector better, and a design is easier to read."""
+    step = 10 ** math.floor(math.log10(distance_m)) / 20
+    return round(distance_m / step) * step
+
+
+def _split(information: PlaneInformation, distances_m: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
+    """Shares of the light of two pairs, between a tenth and nine tenths."""
+
+    def left_m(near: float) -> float:
+        return loop_errors(information, Planes(distances_m, (near, 1 - near)), rate_hz=rate_hz).photon_m
+
+    found = scipy.optimize.minimize_scalar(left_m, bounds=(0.1, 0.9), method="bounded", options={"xatol": 0.02})
+    near = round(float(found["x"]), 2)
+    return near, round(1 - near, 2)
