@@ -40,6 +40,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sweep studies/03-closed-loop
 	$(BIN)/nlcwfs sweep studies/04-faint-stars
 	$(BIN)/nlcwfs sweep studies/05-fewer-planes
+	$(BIN)/nlcwfs sensitivity studies/06-sensitivity
 	$(BIN)/nlcwfs sensitivity studies/07-contrast/sensors
 	$(BIN)/nlcwfs contrast studies/07-contrast/loop.toml --loop --out studies/07-contrast
 	$(BIN)/nlcwfs contrast studies/07-contrast/contrast.toml --out studies/07-contrast

@@ -8,7 +8,15 @@ from typer.testing import CliRunner
 from nlcwfs.cli import app
 from nlcwfs.config import default_toml
 
-STUDIES = ("01-single-frame", "02-every-method", "03-closed-loop", "04-faint-stars", "05-fewer-planes", "07-contrast")
+STUDIES = (
+    "01-single-frame",
+    "02-every-method",
+    "03-closed-loop",
+    "04-faint-stars",
+    "05-fewer-planes",
+    "06-sensitivity",
+    "07-contrast",
+)
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 
 

@@ -22,10 +22,12 @@ from nlcwfs.simulation.sensitivity import (
 )
 from nlcwfs.simulation.sensitivity_curve import sensitivity_curve
 from nlcwfs.simulation.sensitivity_optics import optics_of
-from nlcwfs.simulation.sensitivity_settings import SensitivityCase, SensitivityQuestion
+from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
 
-SMALL = SensitivityQuestion(question="?", cells_across_pupil=64, window=2.0, cycles_per_aperture=(3.0,))
+CELLS = LightCells(across_pupil=64, window=2.0)
+SMALL = SensitivityQuestion(question="?", flat=CELLS, rough=CELLS, cycles_per_aperture=(3.0,))
 RADIAN_M = 0.85e-6 / (2 * np.pi)
+FINE_SPOTS = ("shack_hartmann.field_lambda_over_d=16", "shack_hartmann.pixels=256")
 
 
 def curve(case: SensitivityCase, rms_rad: float = 0.0, asked: SensitivityQuestion = SMALL):
@@ -76,7 +78,12 @@ def test_lenslets_see_what_varies_within_one(cycles):
         name="lenslets",
         sensor="shack-hartmann",
         reconstruction="linear",
-        set=(f"shack_hartmann.subapertures={across}", catch, "shack_hartmann.field_lambda_over_d=16", "shack_hartmann.pixels=256"),
+        set=(
+            f"shack_hartmann.subapertures={across}",
+            catch,
+            "shack_hartmann.field_lambda_over_d=16",
+            "shack_hartmann.pixels=256",
+        ),
     )
     asked = SMALL.model_copy(update={"cycles_per_aperture": (cycles,)})
     found = curve(case, asked=asked)
@@ -110,7 +117,9 @@ def within_lenslets(wave: np.ndarray, weights: np.ndarray, across: int) -> float
 def test_rough_light_needs_twice_the_photons_whatever_the_frequency():
     """Fully speckled light shows one of two quadratures: a factor of 2."""
     case = SensitivityCase(name="planes")
-    asked = SMALL.model_copy(update={"window": 4.0, "cycles_per_aperture": (3.0, 8.0), "wavefronts": 2})
+    asked = SMALL.model_copy(
+        update={"rough": LightCells(across_pupil=64, window=4.0), "cycles_per_aperture": (3.0, 8.0), "wavefronts": 2}
+    )
     found = curve(case, 12.0, asked)
     np.testing.assert_allclose(found.factor, 2.0, rtol=0.06)  # the far rim of the speckles, two wavefronts
     assert found.wavefronts == 2
@@ -121,7 +130,7 @@ def test_the_mean_of_drawn_wavefronts_is_that_of_the_closed_form():
     case = SensitivityCase(
         name="curvature", reconstruction="linear", set=("curvature_sensor.distances_km=[-1000, 1000]",)
     )
-    asked = SMALL.model_copy(update={"cells_across_pupil": 48, "cycles_per_aperture": (8.0,)})
+    asked = SMALL.model_copy(update={"rough": LightCells(across_pupil=48, window=2.0), "cycles_per_aperture": (8.0,)})
     exact = curve(case, 3.0, asked).factor[0]
     air = Turbulence.from_rms(opd_rms_m=3.0 * RADIAN_M, diameter_m=8.0)
     optics = optics_of(case, case.config(None, asked.set), asked, air)
@@ -165,7 +174,7 @@ def test_ripples_are_orthonormal_where_the_light_is():
 
 def test_frequencies_beyond_the_cells_are_refused():
     case, asked = SensitivityCase(name="x"), SMALL.model_copy(update={"cycles_per_aperture": (17.0,)})
-    with pytest.raises(SamplingError, match="at most 16 cycles per aperture .* got 17"):
+    with pytest.raises(SamplingError, match=r"at most 16 cycles per aperture .* got 17"):
         curve(case, asked=asked)
 
 

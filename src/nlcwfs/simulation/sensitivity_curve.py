@@ -75,7 +75,8 @@ def sensitivity_curve(
 
     Examples:
         >>> case = SensitivityCase(name="planes")
-        >>> asked = SensitivityQuestion(question="?", cells_across_pupil=64, window=2.0, cycles_per_aperture=(4, 8))
+        >>> cells = LightCells(across_pupil=64, window=2.0)
+        >>> asked = SensitivityQuestion(question="?", flat=cells, cycles_per_aperture=(4, 8))
         >>> curve = sensitivity_curve(case, case.config(None, asked.set), asked, rms_rad=0.0)
         >>> [round(float(factor), 1) for factor in curve.factor]
         [1.5, 2.4]

@@ -11,6 +11,7 @@ from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.spectrum import Spectrum
+from nlcwfs.comparison_sensors.pyramid import Pyramid
 from nlcwfs.comparison_sensors.shack_hartmann import ShackHartmann, lenslet_grid
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
@@ -18,7 +19,7 @@ from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.speckle_blur import blurred
 from nlcwfs.simulation.exposure import distances_m, round_pupil, static_aberration, wavelength_m
 from nlcwfs.simulation.sensitivity import Optics
-from nlcwfs.simulation.sensitivity_settings import SensitivityCase, SensitivityQuestion
+from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
 
 
 def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuestion, air: Turbulence | None) -> Optics:
@@ -27,8 +28,8 @@ def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuesti
     Args:
         case: Which one.
         config: Its settings.
-        question: Cells and window.
-        air: The turbulence that the grid must carry; None for a flat wavefront.
+        question: Cells and pixels.
+        air: The turbulence that the cells must carry; None for a flat wavefront.
 
     Raises:
         SettingsError: If settings contradict each other.
@@ -37,20 +38,23 @@ def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuesti
     Examples:
         >>> case = SensitivityCase(name="linear curvature", set=("curvature_sensor.distances_km=[-1000, 1000]",))
         >>> config = case.config(None, ())
-        >>> asked = SensitivityQuestion(question="?", cells_across_pupil=32, window=2.0)
+        >>> asked = SensitivityQuestion(question="?", flat=LightCells(across_pupil=32, window=2.0))
         >>> optics = optics_of(case, config, asked, None)
         >>> optics.grid.shape, optics.images(jnp.zeros((64, 64))).shape
         ((64, 64), (2, 64, 64))
     """
+    cells = question.flat if air is None else question.rough
     if case.sensor == "shack-hartmann":
         return _lenslets(config, air)
-    return _curvature(config, question)
+    if case.sensor == "pyramid":
+        return _pyramid(config, cells)
+    return _curvature(config, cells, cells.across_pupil // (question.pixels_across_pupil or cells.across_pupil))
 
 
-def _curvature(config: Config, question: SensitivityQuestion) -> Optics:
+def _curvature(config: Config, cells: LightCells, binning: int) -> Optics:
     """Defocused images: curvature of any distance, linear or not, and phase diversity."""
-    across, binning = question.cells_across_pupil, question.binning
-    size = math.ceil(across * question.window)
+    across = cells.across_pupil
+    size = math.ceil(across * cells.window)
     while size % binning or (size - across) % 2 or size != scipy.fft.next_fast_len(size):
         size += 1
     diameter_m, colour_m = config.beam.diameter_m, wavelength_m(config)
@@ -104,6 +108,20 @@ def _lenslets(config: Config, air: Turbulence | None) -> Optics:
 
     weights = light_weights(pupil)
     return Optics(images, grid, weights, diameter_m, colour_m, long_exposure, finest_cpa=settings.subapertures / 2)
+
+
+def _pyramid(config: Config, cells: LightCells) -> Optics:
+    """Four images of the pupil; how turbulence blurs them has no closed form."""
+    across, diameter_m, colour_m = cells.across_pupil, config.beam.diameter_m, wavelength_m(config)
+    grid = Grid((across, across), diameter_m / across)
+    pupil = round_pupil(config).on(grid)
+    colours = Spectrum.monochromatic(colour_m)
+    sensor = Pyramid.build(pupil, grid, diameter_m=diameter_m, spectrum=colours, settings=config.pyramid)
+
+    def images(opd_m: Float[Array, "Y X"]) -> Float[Array, "image v u"]:
+        return sensor.images(opd_m, 1.0).photons
+
+    return Optics(images, grid, light_weights(pupil), diameter_m, colour_m, finest_cpa=config.pyramid.pixels / 2)
 
 
 def _faded(

@@ -26,7 +26,7 @@ class SensitivityCase(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
-    sensor: Literal["curvature", "shack-hartmann"] = "curvature"
+    sensor: Literal["curvature", "shack-hartmann", "pyramid"] = "curvature"
     reconstruction: Literal["linear", "non-linear"] = "non-linear"
     set: tuple[str, ...] = ()
     rms_rad: tuple[Annotated[float, Field(ge=0, le=100)], ...] | None = None
@@ -46,6 +46,9 @@ class SensitivityCase(BaseModel):
         except SettingsError as error:
             raise SettingsError(f"case {self.name}", "; ".join(str(error).splitlines()), list(self.set)) from None
 
+
+FIXED_PYRAMID = ("pyramid.pixels=128", "pyramid.margin_pixels=32", "pyramid.modulation_lambda_over_d=0")
+"""Pixels as fine as the cells of the other sensors; the margin catches what edges scatter."""
 
 PAPER = (
     SensitivityCase(
@@ -70,6 +73,15 @@ PAPER = (
         reconstruction="linear",
         set=("curvature_sensor.distances_km=[-2000, -800, 800, 2000]",),
     ),
+    SensitivityCase(name="fixed pyramid, linear", sensor="pyramid", reconstruction="linear", set=FIXED_PYRAMID),
+    SensitivityCase(name="fixed pyramid, non-linear", sensor="pyramid", set=FIXED_PYRAMID),
+    SensitivityCase(
+        name="pyramid, 3 lambda/D, linear",
+        sensor="pyramid",
+        reconstruction="linear",
+        set=("pyramid.pixels=128", "pyramid.margin_pixels=32", "pyramid.modulation_lambda_over_d=3"),
+        rms_rad=(0, 4),
+    ),
     SensitivityCase(name="curvature, 2500 and 3500 km, non-linear"),
     SensitivityCase(
         name="the same with 2 waves of static aberration",
@@ -77,7 +89,21 @@ PAPER = (
         rms_rad=(0, 4),
     ),
 )
-"""The sensors of Guyon 2010, Fig. 11, at 0.85 um."""
+"""The sensors of Guyon 2010, Fig. 11, at 0.85 um, and a pyramid that is modulated as most are."""
+
+
+class LightCells(BaseModel):
+    """Cells on which the light travels.
+
+    Attributes:
+        across_pupil: Cells across the telescope.
+        window: Width of the window over the diameter of the telescope.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    across_pupil: int = Field(ge=8, le=4096)
+    window: float = Field(ge=1, le=32)
 
 
 class SensitivityQuestion(BaseModel):
@@ -93,8 +119,8 @@ class SensitivityQuestion(BaseModel):
         rms_rad: Errors of the wavefront, Kolmogorov's, tilt included, rms in radians at the wavelength of sensing.
         wavefronts: Wavefronts of a sensor with a non-linear reconstructor; four times as many where a mean has no
             closed form.
-        cells_across_pupil: Cells of the light across the telescope.
-        window: Width of the window of the light over the diameter of the telescope.
+        flat: Cells for a flat wavefront, whose bright rim is sharp.
+        rough: Cells for the others, whose light spreads.
         pixels_across_pupil: Detector pixels across the pupil; the cells themselves when left out.
         zernikes: If given, Zernikes 2 to so many are asked together instead of ripples.
         seed: Of the wavefronts.
@@ -112,13 +138,13 @@ class SensitivityQuestion(BaseModel):
     notes: str = ""
     set: tuple[str, ...] = ("beam.wavelength_um=0.85",)
     cycles_per_aperture: tuple[Annotated[float, Field(gt=0, le=1000)], ...] = Field(
-        default=(1, 1.5, 2, 3, 4, 6, 8, 11, 16), min_length=1
+        default=(1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0), min_length=1
     )
     direction_deg: float = Field(default=0.0, ge=-360, le=360)
-    rms_rad: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(default=(0, 4, 8, 20), min_length=1)
+    rms_rad: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(default=(0.0, 4.0, 8.0, 20.0), min_length=1)
     wavefronts: int = Field(default=8, ge=1, le=10_000)
-    cells_across_pupil: int = Field(default=256, ge=8, le=4096)
-    window: float = Field(default=3.0, ge=1, le=32)
+    flat: LightCells = LightCells(across_pupil=512, window=2.5)
+    rough: LightCells = LightCells(across_pupil=128, window=4.0)
     pixels_across_pupil: int | None = Field(default=None, ge=4, le=4096)
     zernikes: int | None = Field(default=None, ge=2, le=500)
     seed: int = Field(default=0, ge=0, lt=2**31)
@@ -126,17 +152,13 @@ class SensitivityQuestion(BaseModel):
 
     @model_validator(mode="after")
     def _pixels_are_cells(self) -> "SensitivityQuestion":
-        if self.pixels_across_pupil is not None and self.cells_across_pupil % self.pixels_across_pupil:
-            raise ValueError("pixels_across_pupil must divide cells_across_pupil")
+        for cells in (self.flat, self.rough):
+            if self.pixels_across_pupil is not None and cells.across_pupil % self.pixels_across_pupil:
+                raise ValueError(f"pixels_across_pupil must divide across_pupil ({cells.across_pupil})")
         names = [case.name for case in self.case]
         if len(set(names)) < len(names):
             raise ValueError("case.name must be unique")
         return self
-
-    @property
-    def binning(self) -> int:
-        """Cells along a pixel."""
-        return self.cells_across_pupil // (self.pixels_across_pupil or self.cells_across_pupil)
 
 
 def read_question(path: Path) -> SensitivityQuestion:

@@ -48,7 +48,7 @@ def curve_points(question: SensitivityQuestion) -> tuple[CurvePoint, ...]:
     Examples:
         >>> points = curve_points(SensitivityQuestion(question="?", rms_rad=(0, 20)))
         >>> len(points), points[0].name
-        (12, 'Shack-Hartmann, D/d 16, 0 rad')
+        (17, 'Shack-Hartmann, D/d 16, 0 rad')
     """
     asked = sorted({rms for case in question.case for rms in _asked(case, question)})
     configs = {case.name: case.config(None, question.set) for case in question.case}
@@ -113,7 +113,7 @@ def _rows(point: CurvePoint, question: SensitivityQuestion, curve: Curve, device
             "beta_p": _rounded(math.sqrt(curve.factor[number])),
             "wavefronts": curve.wavefronts,
             "light": round(curve.light, 4),
-            "cells_across_pupil": question.cells_across_pupil,
+            "cells_across_pupil": (question.rough if point.rms_rad else question.flat).across_pupil,
             "device": device,
             "error": "",
             "commit": commit,
