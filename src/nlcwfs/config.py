@@ -61,6 +61,7 @@ class Config(BaseModel):
     )
     atmosphere: AtmosphereSettings = Field(default_factory=AtmosphereSettings)
     beam: BeamSettings = Field(default_factory=BeamSettings)
+    contrast: ContrastSettings = Field(default_factory=ContrastSettings)
     curvature_sensor: CurvatureSensorSettings = Field(default_factory=CurvatureSensorSettings)
     detector: DetectorSettings = Field(default_factory=DetectorSettings)
     estimation: EstimationSettings = Field(default_factory=EstimationSettings)
@@ -70,7 +71,6 @@ class Config(BaseModel):
     mirror: MirrorSettings = Field(default_factory=MirrorSettings)
     pyramid: PyramidSettings = Field(default_factory=PyramidSettings)
     shack_hartmann: ShackHartmannSettings = Field(default_factory=ShackHartmannSettings)
-    contrast: ContrastSettings = Field(default_factory=ContrastSettings)
     simulation: SimulationSettings = Field(default_factory=SimulationSettings)
 
     @model_validator(mode="after")

@@ -24,6 +24,12 @@ def setting_in_words(study: ContrastStudy) -> str:
 
     Args:
         study: What is compared.
+
+    Examples:
+        >>> from nlcwfs.config import Config
+        >>> star = {"atmosphere": {"photons_per_s": 7.8e7}}
+        >>> setting_in_words(ContrastStudy.of(Config.model_validate(star)))
+        '8 m telescope, 7.8e+07 photons a second at 0.85 um, image at 0.85 um, r0 16.8 cm at 0.5 um, wind 10 m/s.'
     """
     halo = study.halo
     speeds = ", ".join(f"{speed:g}" for _, speed in halo.winds)
@@ -35,7 +41,18 @@ def setting_in_words(study: ContrastStudy) -> str:
 
 
 def told_rows(study: ContrastStudy) -> list[list[str]]:
-    """What is told, a list of cells for each line: sensor, what, and a value for each angle."""
+    """What is told, a list of cells for each line: sensor, what, and a value for each angle.
+
+    Args:
+        study: What is compared.
+
+    Examples:
+        >>> from nlcwfs.config import Config
+        >>> settings = {"sensors": ["ideal"], "angles_mas": [100.0, 200.0], "rates_hz": [1000.0]}
+        >>> config = Config.model_validate({"atmosphere": {"photons_per_s": 7.8e7}, "contrast": settings})
+        >>> [line[1] for line in told_rows(ContrastStudy.of(config))]
+        ['flux factor', 'C2 at 1000 Hz', 'best rate [Hz]', 'C2 at the best rate']
+    """
     halo, angle_rad = study.halo, np.array(study.told_mas) * MAS_RAD
     lines, least = [], []
     for sensor in study.sensors:
@@ -59,6 +76,13 @@ def answer(study: ContrastStudy) -> str:
 
     Args:
         study: What is compared.
+
+    Examples:
+        >>> from nlcwfs.config import Config
+        >>> settings = {"sensors": ["curvature", "ideal"], "angles_mas": [200.0], "rates_hz": [1000.0]}
+        >>> config = Config.model_validate({"atmosphere": {"photons_per_s": 7.8e7}, "contrast": settings})
+        >>> answer(ContrastStudy.of(config))  # 2.1 to the power 2/3
+        'At 200 mas the halo behind the ideal sensor is 1.64 times fainter than that behind curvature, each at its ...'
     """
     angles = ", ".join(f"{angle:.3g}" for angle in study.told_mas)
     last = told_rows(study)[-1]

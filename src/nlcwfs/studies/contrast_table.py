@@ -122,6 +122,11 @@ def halo_of(config: Config) -> Halo:
 
     Raises:
         SettingsError: If it tells no photons a second.
+
+    Examples:
+        >>> halo = halo_of(Config.model_validate({"atmosphere": {"photons_per_s": 7.8e7}, "beam": {"diameter_m": 6.5}}))
+        >>> round(halo.area_m2, 1), halo.winds
+        (33.2, ((1.0, 10.0),))
     """
     sky, beam = config.atmosphere, config.beam
     photons_per_s = starlight_per_s(config)
