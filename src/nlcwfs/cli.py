@@ -244,9 +244,7 @@ def sensitivity(
         list[float] | None, typer.Option(metavar="RAD", help="Roughness of the wavefront, rms; repeatable.")
     ] = None,
     cpa: Annotated[list[float] | None, typer.Option(metavar="CYCLES", help="Cycles per aperture; repeatable.")] = None,
-    sensor: Annotated[
-        list[str] | None, typer.Option(metavar="TEXT", help="Only sensors with this in their names; repeatable.")
-    ] = None,
+    sensor: Annotated[list[str] | None, typer.Option(metavar="TEXT", help="Only sensors named so; repeatable.")] = None,
     settings: SetOption = None,
     quiet: QuietOption = False,
 ) -> None:

@@ -26,7 +26,7 @@ from nlcwfs.simulation.sensitivity import (
 from nlcwfs.simulation.sensitivity_optics import optics_of
 from nlcwfs.simulation.sensitivity_settings import SensitivityCase, SensitivityQuestion
 
-MORE_WAVEFRONTS = 4
+MORE_WAVEFRONTS = 16
 """A mean without closed form takes so many times the wavefronts of a sensor that looks at each: it varies more."""
 
 Progress = Callable[[int, int], None]
@@ -66,7 +66,7 @@ def sensitivity_curve(
         case: The sensor.
         config: Its settings.
         question: Modes, cells, number of wavefronts.
-        rms_rad: Mean rms of the Kolmogorov wavefronts, tilt included.
+        rms_rad: Rms of the Kolmogorov wavefronts, tilt included: of each that is drawn, of all where a mean is exact.
         progress: Told after every wavefront.
 
     Raises:
@@ -99,11 +99,11 @@ def sensitivity_curve(
         if question.zernikes is not None:
             raise SettingsError("zernikes", "must be left out where a linear sensor's mean must be drawn", case.name)
         count = MORE_WAVEFRONTS * question.wavefronts
-        drawn = _drawn(optics, air, question.seed, count, progress)
+        drawn = _drawn(optics, air, rms_rad * radian_m, (question.seed, count), progress)
         several = [_factors(np.diag(SignalSums.of(at(opd_m) for opd_m in drawn).information()), question)]
     else:
         count = question.wavefronts
-        drawn = _drawn(optics, air, question.seed, count, progress)
+        drawn = _drawn(optics, air, rms_rad * radian_m, (question.seed, count), progress)
         several = [_factors(information(at(opd_m)), question) for opd_m in drawn]
     alone, together = (np.array(factors) for factors in zip(*several, strict=True))
     if linear and question.zernikes is None:
@@ -140,15 +140,18 @@ def _averaged(seen: Signals, optics: Optics, air: Turbulence) -> Signals:
     return Signals(fade(seen.mean, air), jax.lax.map(lambda change: fade(change, air), seen.changes))
 
 
-def _drawn(optics: Optics, air: Turbulence, seed: int, count: int, progress: Progress) -> Iterator[Float[Array, "Y X"]]:
-    """Independent wavefronts without piston, zero outside the pupil; the first are the same for any number."""
+def _drawn(
+    optics: Optics, air: Turbulence, rms_m: float, chosen: tuple[int, int], progress: Progress
+) -> Iterator[Float[Array, "Y X"]]:
+    """Independent wavefronts of exactly this rms, without piston, zero outside the pupil; a seed and how many."""
+    seed, count = chosen
     lit = np.flatnonzero(optics.weights.any(axis=1))
     margin = int(min(lit[0], optics.grid.shape[0] - 1 - lit[-1]))
     inner = tuple(size - 2 * margin for size in optics.grid.shape)
     screens = PhaseScreens.build(air, shape=(inner[0], inner[1]), pixel_m=optics.grid.pixel_m)
     weights = jnp.asarray(optics.weights, jnp.float32)
     for number in range(count):
-        screen_m = screens.draw(jax.random.fold_in(jax.random.key(seed), number))
-        opd_m = jnp.pad(screen_m, margin)
-        yield jnp.where(weights > 0, opd_m - jnp.sum(weights * opd_m), 0)
+        screen_m = jnp.pad(screens.draw(jax.random.fold_in(jax.random.key(seed), number)), margin)
+        opd_m = jnp.where(weights > 0, screen_m - jnp.sum(weights * screen_m), 0)
+        yield opd_m * (rms_m / jnp.sqrt(jnp.sum(weights * opd_m**2)))
         progress(number + 1, count)
