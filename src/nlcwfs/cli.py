@@ -209,9 +209,7 @@ def sweep(
 @mendable
 def contrast(
     config: ConfigArgument = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder of table, figure and page; made if it is not there.")
-    ] = Path("contrast"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of table, figure and page.")] = Path("contrast"),
     loop: Annotated[
         bool, typer.Option("--loop", help="Measure it: run the loop of [loop] behind an ideal coronagraph.")
     ] = False,
