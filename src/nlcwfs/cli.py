@@ -214,6 +214,34 @@ def sweep(
     raise typer.Exit(run(study, SweepOptions(out, workers, scheduler, wait, quiet)))
 
 
+@app.command()
+@mendable
+def sensitivity(
+    study: Annotated[
+        Path | None,
+        typer.Argument(metavar="[STUDY]", help="Folder with sensitivity.toml, or such a file; default: the paper's."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder of table, figure and page; default: that of the study.")
+    ] = None,
+    rms_rad: Annotated[
+        list[float] | None, typer.Option(metavar="RAD", help="Roughness of the wavefront, rms; repeatable.")
+    ] = None,
+    cpa: Annotated[list[float] | None, typer.Option(metavar="CYCLES", help="Cycles per aperture; repeatable.")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(metavar="TEXT", help="Only sensors with this in their names; repeatable.")
+    ] = None,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Photons that each sensor needs at each spatial frequency, relative to the quantum limit."""
+    from nlcwfs.commands.sensitivity import SensitivityOptions
+    from nlcwfs.commands.sensitivity import sensitivity as run
+
+    typed = tuple(rms_rad or ()), tuple(cpa or ()), tuple(sensor or ()), tuple(settings or ())
+    raise typer.Exit(run(SensitivityOptions(study, out, *typed, quiet)))
+
+
 def main() -> None:
     """Entry point of the command `nlcwfs`."""
     try:
