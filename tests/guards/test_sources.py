@@ -53,6 +53,8 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.interop.loop_sensor_aot:aot_sensor": "needs a loop",
     "nlcwfs.simulation.closed_loop.lenslet_modes:slopes_of_cells": "needs the optics of a loop",
     "nlcwfs.simulation.closed_loop.lenslet_modes:waves_between": "needs a loop's light",
+    "nlcwfs.simulation.closed_loop.pyramid_light:pyramid_on": "needs the light of a loop",
+    "nlcwfs.simulation.closed_loop.pyramid_regimes:pyramid_regimes": "the same",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
     "nlcwfs.simulation.closed_loop.faults:damaged": "needs an exposure",
     "nlcwfs.simulation.closed_loop.run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",
