@@ -85,14 +85,14 @@ def test_photons_are_counted_and_those_that_miss_are_told():
 def test_gain_is_one_amid_what_the_loop_leaves(settings):
     """A mode more or less, mean over residuals that the sensor was not made with, in a loop that has settled.
 
-    15 %: six residuals, and a response that differs from one to the next.
+    15 %: four residuals, and a response that differs from one to the next.
     """
     loop = built(*settings)
     mirror, residuals = loop.light.mirror, Residuals(loop.light, loop.measurement.drive)
-    amid = [residuals.draw_m(0.0, number) for number in range(100, 106)]
+    amid = [residuals.draw_m(0.0, number) for number in range(100, 104)]
     memory = measured(loop, shown(loop, amid[0]))[1]._replace(steady=2)
     gains = []
-    for mode in (0, 1, 20):
+    for mode in (0, 20):
         push_m = np.asarray(mirror.opd_m(1e-8 * (np.arange(mirror.count) == mode)))
         pairs = [[measured(loop, shown(loop, one + sign * push_m), memory)[0] for sign in (1, -1)] for one in amid]
         gains.append(np.mean([float(more.residual_m[mode] - less.residual_m[mode]) for more, less in pairs]) / 2e-8)
@@ -162,8 +162,6 @@ def test_what_does_not_fit_is_refused_in_one_line():
         Loop.build(small(*PYRAMID, "pyramid.pixels=60"))
     rule = "must be at most 32, the cells of the light across the telescope, got 60"
     assert str(refusal.value) == f"pyramid.pixels: {rule}"
-    with pytest.raises(SettingsError, match=r"pyramid\.cutoff_cpa: must be at least 0\.\d+, the tilt's, got 0\.51"):
-        Loop.build(small(*PYRAMID, *FIXED, "pyramid.cutoff_cpa=0.51"))
     with pytest.raises(SettingsError, match=r"feedback\.controller: filters the air of loop\.sensor = shack-hartmann"):
         Loop.build(small(*PYRAMID, *FIXED, "feedback.controller=kalman"))
 

@@ -76,7 +76,12 @@ def test_lenslets_see_what_varies_within_one(cycles):
         name="lenslets",
         sensor="shack-hartmann",
         reconstruction="linear",
-        set=(f"shack_hartmann.subapertures={across}", catch, "shack_hartmann.field_lambda_over_d=16", "shack_hartmann.pixels=256"),
+        set=(
+            f"shack_hartmann.subapertures={across}",
+            catch,
+            "shack_hartmann.field_lambda_over_d=16",
+            "shack_hartmann.pixels=256",
+        ),
     )
     asked = SMALL.model_copy(update={"cycles_per_aperture": (cycles,)})
     found = curve(case, asked=asked)
