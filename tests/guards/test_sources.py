@@ -59,6 +59,8 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.simulation.closed_loop.linear_images:within_range": "the same",
     "nlcwfs.estimation.image_matrix:image_matrix": "needs a sensor's images; docs/linear-regime.md shows it in a loop",
     "nlcwfs.simulation.known_sensor:geometry_of": "needs a whole configuration",
+    "nlcwfs.simulation.closed_loop.pyramid_light:pyramid_on": "needs the light of a loop",
+    "nlcwfs.simulation.closed_loop.pyramid_regimes:pyramid_regimes": "the same",
     "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
     "nlcwfs.simulation.closed_loop.faults:damaged": "needs an exposure",
     "nlcwfs.simulation.closed_loop.run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",

@@ -22,8 +22,9 @@ from nlcwfs.interop import loop_folder as folder_of
 from nlcwfs.simulation.closed_loop.loop import Loop
 from nlcwfs.simulation.closed_loop.pyramid_regimes import Residuals
 from nlcwfs.simulation.closed_loop.run import MISSING, LoopTelemetry, run_loop, summary
+from nlcwfs.simulation.exposure import Exposure
 
-PYRAMID = ("loop.sensor=pyramid", "pyramid.pixels=16", "pyramid.margin_pixels=4", "simulation.light_oversampling=3")
+PYRAMID = ("loop.sensor=pyramid", "pyramid.pixels=16", "pyramid.margin_pixels=4", "simulation.light_oversampling=2")
 MODULATED = ("pyramid.modulation_lambda_over_d=1.5", "pyramid.modulation_points=12")
 FIXED = ("pyramid.modulation_lambda_over_d=0",)
 BRIGHT = 1e9
@@ -48,23 +49,25 @@ def exposed(loop: Loop, frame: int, command_m: np.ndarray):
     return loop.light.expose(jnp.asarray(frame, jnp.int32), line, state.image, jnp.zeros_like(loop.light.weights))
 
 
-def measured_m(loop: Loop, wavefront_m: np.ndarray, memory=None) -> np.ndarray:
-    """Modes that are seen in very many photons, each where it is expected."""
+def shown(loop: Loop, wavefront_m: np.ndarray) -> Exposure:
+    """Very many photons, each where it is expected, of a wavefront on the lit part of the light."""
     photons = loop.light.optics.images(jnp.asarray(wavefront_m, jnp.float32), BRIGHT)
-    exposure = exposed(loop, 0, np.zeros(loop.light.mirror.count)).exposure
-    exposure = eqx.tree_at(lambda one: one.frames.electrons, exposure, photons)
-    usable = jnp.ones(photons.shape, bool)
-    sight, _ = loop.measurement.measure(exposure, usable, jnp.zeros_like(loop.light.weights), memory)
-    return np.asarray(sight.residual_m)
+    empty = exposed(loop, 0, np.zeros(loop.light.mirror.count)).exposure
+    return eqx.tree_at(lambda one: one.frames.electrons, empty, photons)
+
+
+def measured(loop: Loop, exposure: Exposure, memory=None):
+    usable = jnp.isfinite(exposure.frames.electrons)
+    return loop.measurement.measure(exposure, usable, jnp.zeros_like(loop.light.weights), memory)
 
 
 def test_the_air_and_the_score_are_those_of_the_curvature_sensor():
-    loop, other = built(), Loop.build(small("loop.sensor=ideal", "simulation.light_oversampling=3"))
+    loop, other = built(), Loop.build(small("loop.sensor=ideal", "simulation.light_oversampling=2"))
     command_m = np.linspace(-1e-7, 1e-7, loop.light.mirror.count)
     ours, theirs = exposed(loop, 3, command_m), exposed(other, 3, command_m)
     np.testing.assert_array_equal(ours.exposure.opd_m, theirs.exposure.opd_m)
     np.testing.assert_array_equal(ours.exposure.truth_m, theirs.exposure.truth_m)
-    assert float(ours.square_m2) == float(theirs.square_m2)
+    assert float(ours.square_m2) == pytest.approx(float(theirs.square_m2), rel=1e-5)  # order of a sum
 
 
 def test_photons_are_counted_and_those_that_miss_are_told():
@@ -80,20 +83,19 @@ def test_photons_are_counted_and_those_that_miss_are_told():
 
 @pytest.mark.parametrize("settings", [MODULATED, FIXED], ids=["modulated", "fixed"])
 def test_gain_is_one_amid_what_the_loop_leaves(settings):
-    """Light linear in a mode more or less, mean over residuals that the sensor was not made with: its own modes.
+    """A mode more or less, mean over residuals that the sensor was not made with, in a loop that has settled.
 
-    15 %: eight residuals, and a response that differs from one to the next.
+    15 %: four residuals, and a response that differs from one to the next.
     """
     loop = built(*settings)
-    mirror, residuals = loop.light.mirror, Residuals(loop.config, loop.light, loop.measurement.drive)
-    amid = [residuals.draw_m(0.0, number) for number in range(100, 108)]
-    begun = measured_m(loop, amid[0])
-    assert np.isfinite(begun).all()
+    mirror, residuals = loop.light.mirror, Residuals(loop.light, loop.measurement.drive)
+    amid = [residuals.draw_m(0.0, number) for number in range(100, 104)]
+    memory = measured(loop, shown(loop, amid[0]))[1]._replace(steady=2)
     gains = []
-    for mode in (0, 1, 5, 20):
+    for mode in (0, 20):
         push_m = np.asarray(mirror.opd_m(1e-8 * (np.arange(mirror.count) == mode)))
-        both = [measured_m(loop, one + push_m)[mode] - measured_m(loop, one - push_m)[mode] for one in amid]
-        gains.append(np.mean(both) / 2e-8)
+        pairs = [[measured(loop, shown(loop, one + sign * push_m), memory)[0] for sign in (1, -1)] for one in amid]
+        gains.append(np.mean([float(more.residual_m[mode] - less.residual_m[mode]) for more, less in pairs]) / 2e-8)
     np.testing.assert_allclose(gains, 1, atol=0.15)
 
 
@@ -133,37 +135,33 @@ def test_it_survives(fault):
     assert np.median(told.rms_nm[-20:]) < 1.4 * np.median(told.rms_nm[30:40])
 
 
-def test_a_star_without_light_is_told_and_nothing_moves():
+def test_without_light_nothing_is_said_of_the_modes():
     loop = built()
-    dim = small(*PYRAMID, *MODULATED, "atmosphere.photons_per_s=0.01", "loop.give_up_s=0.02")
-    dark = Loop.build(dim)
-    state, records = run_loop(dark)
-    assert summary(dark, state, records, 1.0)["outcome"] == "not closed"
-    assert set(LoopTelemetry.of(records).outcome) == {int(Outcome.NO_LIGHT)}
-    assert not LoopTelemetry.of(records).command_m.any()
-    assert loop.light.mirror.count == dark.light.mirror.count
+    exposure = shown(loop, np.zeros(loop.light.weights.shape))
+    dark = eqx.tree_at(lambda one: one.frames.electrons, exposure, jnp.zeros((4, 24, 24)))
+    sight, memory = measured(loop, dark)
+    assert sight.outcome is Outcome.NO_LIGHT
+    assert memory is None
+    assert not np.asarray(sight.residual_m).any()
 
 
-def test_modes_beyond_the_cutoff_are_not_driven_and_actuators_are():
-    driven = (*MODULATED, "pyramid.cutoff_cpa=3", "mirror.kind=karhunen-loeve")
-    loop = Loop.build(small(*PYRAMID, *driven, "loop.seconds=0.02"))
-    told = LoopTelemetry.of(run_loop(loop)[1])
-    cycles = np.asarray(loop.light.mirror.cycles_per_aperture)
-    assert told.command_m[-1][cycles <= 3].all()
-    assert not told.command_m[:, cycles > 3].any()
-    pushed = small(*PYRAMID, *MODULATED, "mirror.kind=actuators", "mirror.actuators_across=11")
-    loop = Loop.build(pushed)
+def test_actuators_are_driven_up_to_the_cutoff():
+    pushed = (*FIXED, "mirror.kind=actuators", "mirror.actuators_across=11", "pyramid.cutoff_cpa=4")
+    loop = Loop.build(small(*PYRAMID, *pushed))
+    assert (
+        float(np.max(np.asarray(loop.measurement.drive.modes.cycles_per_aperture)[: loop.measurement.drive.driven]))
+        <= 4
+    )
     state, records = run_loop(loop)
     assert summary(loop, state, records, 1.0)["outcome"] == "closed"
+    assert LoopTelemetry.of(records).command_m.shape[1] == loop.light.mirror.count
 
 
 def test_what_does_not_fit_is_refused_in_one_line():
     with pytest.raises(SettingsError) as refusal:
         Loop.build(small(*PYRAMID, "pyramid.pixels=60"))
-    rule = "must be at most 48, the cells of the light across the telescope, got 60"
+    rule = "must be at most 32, the cells of the light across the telescope, got 60"
     assert str(refusal.value) == f"pyramid.pixels: {rule}"
-    with pytest.raises(SettingsError, match=r"pyramid\.cutoff_cpa: must be at least 0\.\d+, the tilt's, got 0\.55"):
-        Loop.build(small(*PYRAMID, *FIXED, "pyramid.cutoff_cpa=0.55"))
     with pytest.raises(SettingsError, match=r"feedback\.controller: filters the air of loop\.sensor = shack-hartmann"):
         Loop.build(small(*PYRAMID, *FIXED, "feedback.controller=kalman"))
 

@@ -6,13 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.comparison_sensors.pyramid import Pyramid
 from nlcwfs.config import Config
 from nlcwfs.estimation.gain_regimes import Regime
 from nlcwfs.estimation.mean_response import mean_derivative
+from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.simulation.closed_loop.driven_modes import DrivenModes
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics, pyramid_on
@@ -36,6 +37,10 @@ NOISE_SHARE = 3.0
 """Variance of a mode's noise in the closed loop, over the quantum limit of an exposure, as the regimes assume it."""
 
 
+RESIDUAL_KEY = 40961
+"""Random key of the residuals: not that of any sky."""
+
+
 class Direction(eqx.Module):
     """A pyramid seen from single points of its circle, the mean of which is its image."""
 
@@ -50,9 +55,9 @@ class Direction(eqx.Module):
 class Residuals:
     """Draws wavefronts as a loop leaves them: the mirror's modes of a share of the air's strength, and all beyond."""
 
-    def __init__(self, config: Config, light: LoopLight, drive: DrivenModes) -> None:
+    def __init__(self, light: LoopLight, drive: DrivenModes) -> None:
         self.light, self.drive = light, drive
-        self.seed = config.seed
+        self.parts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def closed_m2(self) -> Float[np.ndarray, " driven"]:
         """Variance of the driven modes that a closed loop leaves, about."""
@@ -68,19 +73,28 @@ class Residuals:
 
     def draw_m(self, share: float, number: int) -> Float[np.ndarray, "lit_y lit_x"]:
         """A wavefront; odd numbers are the negatives of the even ones before."""
-        modes, count = self.drive.modes, self.drive.driven
-        screen_m = self.light.still.screens.draw(jax.random.fold_in(jax.random.key(RESIDUAL_KEY), number // 2))
-        kept = np.ones(modes.count)
+        if number // 2 not in self.parts:
+            key = jax.random.fold_in(jax.random.key(RESIDUAL_KEY), number // 2)
+            beyond_m, fitted_m = _drawn(self.light, self.drive.modes, key)
+            self.parts[number // 2] = np.asarray(beyond_m), np.asarray(fitted_m)
+        beyond_m, fitted_m = self.parts[number // 2]
+        kept, count, modes = np.ones(fitted_m.size), self.drive.driven, self.drive.modes
         kept[:count] = np.sqrt(self.prior_m2(share) / self.drive.open_m2[:count])
-        fitted_m = modes.fitted(screen_m)
-        drawn_m = screen_m - modes.opd_m(fitted_m) + modes.opd_m(fitted_m * jnp.asarray(kept, fitted_m.dtype))
-        weights = self.light.weights
-        drawn_m = jnp.where(weights > 0, drawn_m - jnp.sum(weights * drawn_m), 0)
-        return np.asarray(drawn_m) * (-1) ** number
+        lit = np.asarray(modes.rows), np.asarray(modes.columns)
+        drawn_m = beyond_m.copy()
+        drawn_m[lit] += (kept * fitted_m).astype(fitted_m.dtype) @ np.asarray(modes.shapes)
+        return drawn_m * (-1) ** number
 
 
-RESIDUAL_KEY = 40961
-"""Random key of the residuals: not that of any sky."""
+@eqx.filter_jit
+def _drawn(
+    light: LoopLight, modes: Mirror, key: PRNGKeyArray
+) -> tuple[Float[Array, "lit_y lit_x"], Float[Array, " mode"]]:
+    """What the modes cannot make of a screen, without piston, and the modes."""
+    screen_m = light.still.screens.draw(key)
+    fitted_m = modes.fitted(screen_m)
+    beyond_m = screen_m - modes.opd_m(fitted_m)
+    return jnp.where(light.weights > 0, beyond_m - jnp.sum(light.weights * beyond_m), 0), fitted_m
 
 
 def pyramid_regimes(
@@ -94,7 +108,7 @@ def pyramid_regimes(
         optics: The pyramid.
         drive: The modes.
     """
-    residuals, cells = Residuals(config, light, drive), _coarser(light.part, optics.sensor.pixel_m)
+    residuals, cells = Residuals(light, drive), _coarser(light.part, optics.sensor.pixel_m)
     model = Direction(pyramid_on(config, light.still, cells))
     maps = np.stack([_on_cells(one, light, cells) for one in _shapes(drive)])
     points = len(optics.sensor.circle_rad)
