@@ -58,6 +58,8 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.simulation.closed_loop.run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",
     "nlcwfs.simulation.closed_loop.run:summary": "needs a run of the loop",
     "nlcwfs.simulation.closed_loop.run:loop_bounds": "needs a loop",
+    "nlcwfs.simulation.design.design:design": "half a minute; `nlcwfs design` and docs/design.md show it",
+    "nlcwfs.studies.design_picture:draw_design": "needs a design",
     "nlcwfs.studies.sweep_points:read_sweep": "needs a file; docs/sweeps.md shows it",
     "nlcwfs.studies.sweep_cluster:connected": "needs a scheduler; docs/sweeps.md shows it",
     "nlcwfs.studies.sweep_run:run_sweep": "needs workers, and minutes",

@@ -103,6 +103,7 @@ def errors_with(
 
         >>> from nlcwfs.atmosphere.phase_screen import Turbulence
         >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> from nlcwfs.simulation.design.loop_residual import Loop
         >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
         >>> left = LoopResidual.build(small, PupilShape(1.0))
         >>> found = errors_with(left, [4 * np.eye(left.basis.count)], rate_hz=500.0)
