@@ -40,6 +40,10 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sweep studies/03-closed-loop
 	$(BIN)/nlcwfs sweep studies/04-faint-stars
 	$(BIN)/nlcwfs sweep studies/05-fewer-planes
+	$(BIN)/nlcwfs sensitivity studies/06-sensitivity
+	$(BIN)/nlcwfs sensitivity studies/07-contrast/sensors
+	$(BIN)/nlcwfs contrast studies/07-contrast/loop.toml --loop --out studies/07-contrast
+	$(BIN)/nlcwfs contrast studies/07-contrast/contrast.toml --out studies/07-contrast
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructors against that of their own FFTs, and of a frame of the loop

@@ -14,6 +14,8 @@ STUDIES = (
     "03-closed-loop",
     "04-faint-stars",
     "05-fewer-planes",
+    "06-sensitivity",
+    "07-contrast",
     "08-planes-and-pixels",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from nlcwfs.commands.console import INTERRUPTED, mendable
+from nlcwfs.commands.options import ConfigArgument, QuietOption, SeedOption, SetOption
 from nlcwfs.errors import SettingsError
 
 app = typer.Typer(
@@ -24,16 +25,6 @@ app = typer.Typer(
     epilog="Exit codes: 0 done; 1 done, but a wavefront is not to be believed (written and flagged); 2 something "
     "that you can mend, told in one line; 130 interrupted, what was done is kept.",
 )
-
-ConfigArgument = Annotated[
-    Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Settings; what it leaves out is default.")
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, such as beam.diameter_m=6.5; repeatable."),
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
-SeedOption = Annotated[int | None, typer.Option(help="Which sky and noise; the same seed, the same numbers.")]
 
 
 @app.command()
@@ -212,6 +203,57 @@ def sweep(
     if scheduler is not None and workers is not None:
         raise SettingsError("--workers", "must be left out with --scheduler, which has its own", workers)
     raise typer.Exit(run(study, SweepOptions(out, workers, scheduler, wait, quiet)))
+
+
+@app.command()
+@mendable
+def contrast(
+    config: ConfigArgument = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder of table, figure and page; made if it is not there.")
+    ] = Path("contrast"),
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Measure it: run the loop of [loop] behind an ideal coronagraph.")
+    ] = False,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Predict the halo around a star: contrast C2 of lag and photon noise, by angle, rate and sensor.
+
+    Tells the best rate of each angle, and the gain of the last sensor over the first. What --loop has put into the same
+    folder is drawn beside it.
+    """
+    from nlcwfs.commands.contrast import contrast as predict
+    from nlcwfs.commands.contrast import contrast_of_loop as measure
+    from nlcwfs.config import load_config
+
+    (measure if loop else predict)(load_config(config, settings or []), out, quiet=quiet)
+
+
+@app.command()
+@mendable
+def sensitivity(
+    study: Annotated[
+        Path | None,
+        typer.Argument(metavar="[STUDY]", help="Folder with sensitivity.toml, or such a file; default: the paper's."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder of table, figure and page; default: that of the study.")
+    ] = None,
+    rms_rad: Annotated[
+        list[float] | None, typer.Option(metavar="RAD", help="Roughness of the wavefront, rms; repeatable.")
+    ] = None,
+    cpa: Annotated[list[float] | None, typer.Option(metavar="CYCLES", help="Cycles per aperture; repeatable.")] = None,
+    sensor: Annotated[list[str] | None, typer.Option(metavar="TEXT", help="Only sensors named so; repeatable.")] = None,
+    settings: SetOption = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Photons that each sensor needs at each spatial frequency, relative to the quantum limit."""
+    from nlcwfs.commands.sensitivity import SensitivityOptions
+    from nlcwfs.commands.sensitivity import sensitivity as run
+
+    typed = tuple(rms_rad or ()), tuple(cpa or ()), tuple(sensor or ()), tuple(settings or ())
+    raise typer.Exit(run(SensitivityOptions(study, out, *typed, quiet)))
 
 
 @app.command()

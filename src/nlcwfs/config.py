@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from nlcwfs.atmosphere.settings import AtmosphereSettings
 from nlcwfs.beam.settings import BeamSettings
-from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
+from nlcwfs.comparison_sensors.settings import LinearCurvatureSettings, PyramidSettings, ShackHartmannSettings
 from nlcwfs.config_messages import ConfigError, problems_in_words, unknown_key
 from nlcwfs.config_text import commented_toml, plain_toml
 from nlcwfs.curvature_sensor.settings import FARTHEST_KM, CurvatureSensorSettings
@@ -25,6 +25,7 @@ from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.feedback.settings import FeedbackSettings
 from nlcwfs.mirror.settings import MirrorSettings
+from nlcwfs.science.settings import ContrastSettings
 from nlcwfs.simulation.closed_loop.settings import LoopSettings
 from nlcwfs.simulation.settings import SimulationSettings
 
@@ -60,12 +61,15 @@ class Config(BaseModel):
     )
     atmosphere: AtmosphereSettings = Field(default_factory=AtmosphereSettings)
     beam: BeamSettings = Field(default_factory=BeamSettings)
+    contrast: ContrastSettings = Field(default_factory=ContrastSettings)
     curvature_sensor: CurvatureSensorSettings = Field(default_factory=CurvatureSensorSettings)
     detector: DetectorSettings = Field(default_factory=DetectorSettings)
     estimation: EstimationSettings = Field(default_factory=EstimationSettings)
     feedback: FeedbackSettings = Field(default_factory=FeedbackSettings)
+    linear_curvature: LinearCurvatureSettings = Field(default_factory=LinearCurvatureSettings)
     loop: LoopSettings = Field(default_factory=LoopSettings)
     mirror: MirrorSettings = Field(default_factory=MirrorSettings)
+    pyramid: PyramidSettings = Field(default_factory=PyramidSettings)
     shack_hartmann: ShackHartmannSettings = Field(default_factory=ShackHartmannSettings)
     simulation: SimulationSettings = Field(default_factory=SimulationSettings)
 

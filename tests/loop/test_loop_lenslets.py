@@ -20,8 +20,9 @@ from nlcwfs.estimation.loop_reconstructor import LoopModes, loop_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.slopes_to_modes import average_gradients, minimum_variance, response
 from nlcwfs.interop import loop_folder as folder_of
+from nlcwfs.simulation.closed_loop.driven_modes import moved_share
 from nlcwfs.simulation.closed_loop.lenslet_light import keys_cubic
-from nlcwfs.simulation.closed_loop.lenslet_modes import moved_share, slopes_of_cells
+from nlcwfs.simulation.closed_loop.lenslet_modes import slopes_of_cells
 from nlcwfs.simulation.closed_loop.loop import Loop
 from nlcwfs.simulation.closed_loop.run import MISSING, LoopTelemetry, run_loop, summary
 

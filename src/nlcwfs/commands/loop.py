@@ -61,6 +61,10 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
     say(f"Wrote {out}.", quiet=quiet)
     if config.feedback.controller == "kalman" and numbers["wind"] is None:
         warn("no clear wind was found in loop.learn_after_s, or the run ended before: the loop stayed an integrator")
+    if numbers["linear_range_nm"] is not None and not numbers["frames_linear"]:
+        warn(
+            f"the matrix of the linear regime was not used: its range of {numbers['linear_range_nm']:g} nm is too small"
+        )
     if numbers["outcome"] != "closed":
         warn(f"the loop is {numbers['outcome']}: {reason(numbers)}")
         return NOT_A_SUCCESS

@@ -1,8 +1,12 @@
-"""What a user may choose about a Shack-Hartmann sensor."""
+"""What a user may choose about the sensors that ours is compared with."""
 
-from typing import Literal
+import math
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+FARTHEST_POINTS = 0.8
+"""Most that points of a modulation may lie apart, in units of wavelength / D."""
 
 
 class ShackHartmannSettings(BaseModel):
@@ -69,4 +73,97 @@ class ShackHartmannSettings(BaseModel):
     def _pixels_see_the_spot(self) -> "ShackHartmannSettings":
         if self.field_lambda_over_d / self.pixels > 2:
             raise ValueError("pixels must be at least field_lambda_over_d / 2: larger ones do not see the spot move")
+        return self
+
+
+class PyramidSettings(BaseModel):
+    """The prism in the focus, how the star circles over its tip, and the pixels of its four pupil images.
+
+    Examples:
+        >>> PyramidSettings().read_across
+        60
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    modulation_lambda_over_d: float = Field(
+        default=3.0,
+        ge=0,
+        le=100,
+        description="Radius of the circle that the star describes on the prism in each exposure, in units of "
+        "wavelength / D; 0 for a fixed pyramid.",
+    )
+    modulation_points: int = Field(
+        default=24,
+        ge=4,
+        le=1024,
+        multiple_of=4,
+        description="Points of that circle whose light is summed, at most 0.8 wavelength / D apart: between points "
+        "that lie farther from each other the response to tilt is not even.",
+    )
+    pixels: int = Field(default=44, ge=2, le=1024, description="Detector pixels across a pupil image.")
+    margin_pixels: int = Field(
+        default=8, ge=0, le=512, description="Pixels that are read beyond each rim of a pupil image."
+    )
+    separation: float = Field(
+        default=1.5,
+        ge=1,
+        le=10,
+        description="From the centre of a pupil image to that of its neighbour, in diameters of the image.",
+    )
+    cutoff_cpa: float | None = Field(
+        default=None,
+        gt=0.5,
+        le=500,
+        examples=[16.0],
+        description="Highest frequency that the mirror is driven at, cycles per aperture; leave out for half the "
+        "pixels across, all that they show.",
+    )
+
+    @model_validator(mode="after")
+    def _circle_is_even(self) -> "PyramidSettings":
+        # 3 lambda / D: with 16, 24 and 32 points the response to tilt varies by 41, 2 and 2 % within 0.6 lambda / D
+        least = 4 * math.ceil(2 * math.pi * self.modulation_lambda_over_d / FARTHEST_POINTS / 4)
+        if self.modulation_points < least:
+            raise ValueError(f"modulation_points must be at least {least} on a circle so wide")
+        return self
+
+    @model_validator(mode="after")
+    def _images_lie_apart(self) -> "PyramidSettings":
+        if self.read_across > self.separation * self.pixels * (1 + 1e-9):
+            raise ValueError(
+                f"separation must be at least {self.read_across / self.pixels:.3g}: "
+                f"{self.read_across} pixels are read of each image"
+            )
+        return self
+
+    @property
+    def read_across(self) -> int:
+        """Pixels along a side of the square that is read around a pupil image."""
+        return self.pixels + 2 * self.margin_pixels
+
+
+class LinearCurvatureSettings(BaseModel):
+    """The planes of a curvature sensor that is read by a matrix alone, near enough to the pupil to be linear.
+
+    Examples:
+        >>> LinearCurvatureSettings(distances_km=(-2000, -800, 800, 2000)).distances_km  # dual stroke
+        (-2000.0, -800.0, 800.0, 2000.0)
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    distances_km: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] = Field(
+        default=(-1000.0, 1000.0),
+        min_length=2,
+        examples=[(-2000.0, -800.0, 800.0, 2000.0)],
+        description="where the planes lie, in pairs at +z and -z; two pairs are a dual stroke",
+    )
+
+    @model_validator(mode="after")
+    def _planes_are_pairs(self) -> "LinearCurvatureSettings":
+        planes = sorted(self.distances_km)
+        pairs = planes == sorted(-distance for distance in planes) and 0 not in planes
+        if not pairs or len(set(planes)) < len(planes):
+            raise ValueError("distances_km must be pairs, one plane at +z for each at -z")
         return self

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
+from nlcwfs.beam.real_products import intensity_behind
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.comparison_sensors.settings import ShackHartmannSettings
 from nlcwfs.errors import SamplingError, SettingsError
@@ -184,7 +185,7 @@ class ShackHartmann(eqx.Module):
             phase = parts_m * (2 * math.pi / wavelength_m)
             field = jnp.asarray(share, phase.dtype) ** 0.5 * self.amplitude
             field = jnp.stack([field * jnp.cos(phase), field * jnp.sin(phase)])
-            total = total + _image(field, to_sky)
+            total = total + intensity_behind(field, to_sky, to_sky)
         pixels = total.shape[1] // self.samples
         on_pixels = total.reshape(self.count, pixels, self.samples, pixels, self.samples).sum((2, 4))
         return Spots(photons * on_pixels, self.pixel_rad)
@@ -277,21 +278,3 @@ def _fourier_matrix(angles: Grid, cells: Grid, wavelength_m: float) -> Complex[n
     turn = np.exp(-2j * np.pi / wavelength_m * angles.x_m.T * cells.x_m)
     envelope = np.sinc(cells.pixel_m * angles.x_m.T / wavelength_m)
     return math.sqrt(cells.pixel_m * angles.pixel_m / wavelength_m) * envelope * turn
-
-
-def _image(field: Float[Array, "part spot y x"], to_sky: Complex[Array, "sample cell"]) -> Float[Array, "spot v u"]:
-    """Squared modulus of the Fourier transform of complex fields, given as real and imaginary part.
-
-    Products of real matrices: XLA on CPUs multiplies complex ones several times more slowly.
-    """
-    _, spots, cells, _ = field.shape
-    samples = to_sky.shape[0]
-    both = jnp.concatenate([to_sky.real, to_sky.imag]).T  # cell, (real, imaginary) of a sample
-    along = (field.reshape(-1, cells) @ both).reshape(2, spots, cells, 2, samples)
-    real = along[0, :, :, 0] - along[1, :, :, 1]
-    imaginary = along[0, :, :, 1] + along[1, :, :, 0]
-    half = jnp.stack([real, imaginary]).swapaxes(2, 3)  # part, spot, u, y
-    across = (half.reshape(-1, cells) @ both).reshape(2, spots, samples, 2, samples)
-    real = across[0, :, :, 0] - across[1, :, :, 1]
-    imaginary = across[0, :, :, 1] + across[1, :, :, 0]
-    return (real**2 + imaginary**2).swapaxes(1, 2)

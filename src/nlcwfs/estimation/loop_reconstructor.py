@@ -85,16 +85,31 @@ def loop_reconstructor(known: LoopModes, *, noise_rad2: Float[np.ndarray, " slop
     cross = scipy.linalg.solve(inner, rest.T @ first, assume_a="pos") if modes > driven else np.zeros((0, driven))
     fisher = first.T @ first - (rest.T @ first).T @ cross
     moved = known.moved_m2 / known.open_m2[:driven]
-    prior = np.ones(driven)
-    if closed:
-        prior = np.minimum(1, STEADY_WIND * moved)
-        for _ in range(ROUNDS):
-            prior = np.minimum(1, _left(fisher, prior) + STEADY_WIND * moved)
+    prior = settled_prior(fisher, moved) if closed else np.ones(driven)
     inverse = np.linalg.inv(fisher + np.diag(1 / prior))
     matrix = inverse @ (first.T - cross.T @ rest.T)
     matrix *= amplitude_m[:driven, None] / noise_rad[None, :]
     scale = known.open_m2[:driven]
     return LoopMatrix(matrix, prior * scale, np.diag(inverse) * scale)
+
+
+def settled_prior(
+    fisher: Float[np.ndarray, "mode mode"], moved: Float[np.ndarray, " mode"]
+) -> Float[np.ndarray, " mode"]:
+    """Variance of modes in a loop that has settled: what an estimate leaves, and what the air moves, see above.
+
+    Args:
+        fisher: Information of an exposure, in units of the modes' variance in the open loop.
+        moved: What changes from an exposure to the next, in the same units.
+
+    Examples:
+        >>> settled_prior(np.array([[50.0]]), np.array([0.01 / STEADY_WIND])).round(3).tolist()
+        [0.02]
+    """
+    prior = np.minimum(1, STEADY_WIND * moved)
+    for _ in range(ROUNDS):
+        prior = np.minimum(1, _left(fisher, prior) + STEADY_WIND * moved)
+    return prior
 
 
 def _left(fisher: Float[np.ndarray, "mode mode"], prior: Float[np.ndarray, " mode"]) -> Float[np.ndarray, " mode"]:

@@ -22,7 +22,8 @@ class SensorGeometry:
         wavelength_m: Wavelength of sensing.
         distances_m: Signed distance of each plane from the pupil, positive downstream.
         flux_fractions: Share of the light of each plane; equal when left out.
-        static_opd_m: Known aberration in the arm of the sensor, on the frame's pixels.
+        static_opd_m: Known aberration in the arm of the sensor, on the frame's pixels ...
+        static_grid: ... or on these, which may be finer.
     """
 
     pupil: PupilShape
@@ -31,10 +32,12 @@ class SensorGeometry:
     distances_m: tuple[float, ...]
     flux_fractions: tuple[float, ...] | None = None
     static_opd_m: Float[np.ndarray, "y x"] | None = field(default=None, compare=False)
+    static_grid: Grid | None = None
 
     def model(self, grid: Grid, *, dtype: str) -> CurvatureSensor:
         """The sensor's optics on a grid of the reconstructor."""
-        static = None if self.static_opd_m is None else _resized(self.static_opd_m, self.frame, grid)
+        static, known_on = self.static_opd_m, self.static_grid or self.frame
+        static = None if static is None else _resized(static, known_on, grid)
         return CurvatureSensor.build(
             self.pupil.on(grid),
             grid,
@@ -47,7 +50,12 @@ class SensorGeometry:
 
 
 def _resized(opd_m: Float[np.ndarray, "y x"], frame: Grid, grid: Grid) -> Float[np.ndarray, "v u"]:
-    """A smooth aberration on other pixels, by cubic splines; the rim goes on beyond the frame."""
+    """An aberration on other pixels: means over larger ones, then cubic splines; the rim goes on beyond the frame."""
+    coarser = round(grid.pixel_m / frame.pixel_m)
+    if coarser > 1:
+        opd_m = scipy.ndimage.uniform_filter(opd_m, coarser, mode="nearest")
+        if coarser % 2 == 0:  # SciPy centres an even window half a pixel low
+            opd_m = scipy.ndimage.shift(opd_m, -0.5, order=3, mode="nearest")
     rows = grid.y_m.ravel() / frame.pixel_m + (frame.shape[0] - 1) / 2
     columns = grid.x_m.ravel() / frame.pixel_m + (frame.shape[1] - 1) / 2
     points = np.meshgrid(rows, columns, indexing="ij")

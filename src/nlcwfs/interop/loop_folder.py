@@ -160,7 +160,7 @@ def write_records(folder: Path, loop: Loop, records: list[Record], stamp: Proven
     for place, name in enumerate(GROUPS):
         columns[f"{name}_nm"] = np.round(told.group_nm[:, place], 3)
     columns |= {"predicted_nm": np.round(told.predicted_nm, 3), "outcome": told.outcome}
-    columns |= {"followed": told.closed, "ffts": told.ffts}
+    columns |= {"followed": told.closed, "linear": told.linear, "ffts": told.ffts}
     table = Table(columns, meta=stamp.as_dict())
     with atomic_write(folder / RECORDS) as path:
         table.write(path, format="ascii.ecsv", overwrite=True)

@@ -5,6 +5,7 @@ import numpy as np
 
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.loop import Loop
+from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
 
 
 def aot_sensor(
@@ -22,6 +23,17 @@ def aot_sensor(
             subaperture_mask=aotpy.Image("subaperture mask", number),
             subaperture_size=optics.sensor.subaperture_m,
             centroiding_algorithm=loop.config.shack_hartmann.centroid,
+            **common,
+        )
+    if isinstance(optics, PyramidOptics):
+        modes, circle = measured.data.shape[2], loop.config.pyramid.modulation_lambda_over_d
+        return aotpy.Pyramid(
+            "sensor",
+            n_sides=4,
+            dimensions=1,
+            measurements=measured,
+            n_valid_subapertures=modes,
+            modulation=circle * common["wavelength"],  # path from rim to rim
             **common,
         )
     # the standard knows no curvature sensor; pupil images side by side come nearest

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.science.coronagraph import coronagraphic_image
 from nlcwfs.science.point_spread_function import point_spread_function, strehl_ratio
 
 
@@ -23,6 +24,7 @@ class LongExposure(eqx.Module):
         wavelength_m: Wavelength of the image; need not be that of the sensor.
         pixel_m: Width of a pixel at the pupil.
         angles: Directions on the sky; its `pixel_m` is read as radians per pixel.
+        coronagraph: Whether an ideal coronagraph stands before the camera; the Strehl ratio is that without it.
     """
 
     pupil: Float[Array, "y x"]
@@ -32,6 +34,7 @@ class LongExposure(eqx.Module):
     wavelength_m: float = eqx.field(static=True)
     pixel_m: float = eqx.field(static=True)
     angles: Grid = eqx.field(static=True)
+    coronagraph: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def init(
@@ -42,6 +45,7 @@ class LongExposure(eqx.Module):
         pixel_m: float,
         angles: Grid,
         dtype: str = "float32",
+        coronagraph: bool = False,
     ) -> "LongExposure":
         """Begin with no image at all.
 
@@ -51,6 +55,7 @@ class LongExposure(eqx.Module):
             pixel_m: Width of a pixel at the pupil.
             angles: Directions on the sky; its `pixel_m` is read as radians per pixel.
             dtype: Precision of the sums.
+            coronagraph: Whether an ideal coronagraph stands before the camera.
 
         Examples:
             >>> exposure = LongExposure.init(
@@ -69,14 +74,14 @@ class LongExposure(eqx.Module):
             wavelength_m=wavelength_m,
             pixel_m=pixel_m,
             angles=angles,
+            coronagraph=coronagraph,
         )
 
     def add(self, opd_m: Float[Array | np.ndarray, "y x"]) -> "LongExposure":
         """The same with one more image, of a residual wavefront; all count alike."""
         opd_m = jnp.asarray(opd_m, self.image_sum.dtype)
-        image = point_spread_function(
-            self.pupil, opd_m, wavelength_m=self.wavelength_m, pixel_m=self.pixel_m, angles=self.angles
-        )
+        imaged = coronagraphic_image if self.coronagraph else point_spread_function
+        image = imaged(self.pupil, opd_m, wavelength_m=self.wavelength_m, pixel_m=self.pixel_m, angles=self.angles)
         strehl = strehl_ratio(self.pupil, opd_m, wavelength_m=self.wavelength_m)
         return LongExposure(
             self.pupil,
@@ -86,6 +91,7 @@ class LongExposure(eqx.Module):
             self.wavelength_m,
             self.pixel_m,
             self.angles,
+            self.coronagraph,
         )
 
     @property

@@ -15,7 +15,11 @@ Row = dict[str, str | int | float]
 LAST = ("device", "error", "commit", "digest")
 """Columns at the end of the table, whatever columns join later."""
 
-NEEDED = {"case": ("case", "group", "digest"), "point": ("point", "case", "digest")}
+NEEDED = {
+    "case": ("case", "group", "digest"),
+    "point": ("point", "case", "digest"),
+    "factor": ("factor", "sensor", "digest"),
+}
 """Columns without which a file is no table of a study, by what a row is about."""
 
 
@@ -43,7 +47,12 @@ class StudyTable:
 
     def put(self, row: Row, provenance: Provenance) -> None:
         """Add a row, or replace that of the same name, and write the table."""
-        self.rows = [*(kept for kept in self.rows if kept[self.key] != row[self.key]), row]
+        self.put_all([row], provenance)
+
+    def put_all(self, rows: list[Row], provenance: Provenance) -> None:
+        """Add rows, or replace those of the same names, and write the table once."""
+        names = {row[self.key] for row in rows}
+        self.rows = [*(kept for kept in self.rows if kept[self.key] not in names), *rows]
         self._write(provenance)
 
     def sort(self, names: list[str], provenance: Provenance, *, others: bool = False) -> None:

@@ -7,12 +7,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.zernike import zernikes
 from nlcwfs.config import Config
+from nlcwfs.curvature_sensor.settings import CurvatureSensorSettings
 from nlcwfs.feedback.delay_line import DelayLine
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
+from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
@@ -28,8 +31,8 @@ class Corrected(eqx.Module):
     """One exposure behind the mirror.
 
     Attributes:
-        exposure: What the sensor's detector read; its wavefront is the mean residual.
-        square_m2: Mean over the moments of the residual's variance over the pupil.
+        exposure: What the sensor's detector read; its wavefront is the mean of what the sensor got.
+        square_m2: Mean over the moments of the variance over the pupil of what the star's image got.
         image: The star's image so far.
     """
 
@@ -46,12 +49,14 @@ class LoopLight(eqx.Module):
         mirror: On the part of the light's grid that holds the pupil.
         weights: Share of the light there.
         optics: The sensor's.
+        reference_m: What the sensor sees when the star's image is flat.
     """
 
     sequence: SequenceSimulator
     mirror: Mirror
     weights: Float[Array, "lit_y lit_x"]
     optics: LoopOptics
+    reference_m: Float[Array, "lit_y lit_x"]
 
     @classmethod
     def build(cls, config: Config) -> "LoopLight":
@@ -72,7 +77,10 @@ class LoopLight(eqx.Module):
         optics = CurvatureOptics(still)
         if config.loop.sensor == "shack-hartmann":
             optics = LensletOptics.build(config, still, weights > 0)
-        return cls(sequence=sequence, mirror=mirror, weights=jnp.asarray(weights, dtype), optics=optics)
+        if config.loop.sensor == "pyramid":
+            optics = PyramidOptics.build(config, still, part)
+        reference_m = reference_wavefront_m(config, weights, part)
+        return cls(sequence, mirror, jnp.asarray(weights, dtype), optics, jnp.asarray(reference_m, dtype))
 
     @property
     def still(self) -> ExposureSimulator:
@@ -84,12 +92,13 @@ class LoopLight(eqx.Module):
         """The part of the light's grid that holds the pupil."""
         return Grid((self.weights.shape[0], self.weights.shape[1]), self.still.light.pixel_m)
 
-    def star_image(self, wavelength_m: float) -> LongExposure:
+    def star_image(self, wavelength_m: float, *, coronagraph: bool = False) -> LongExposure:
         """An image to which nothing has been added yet."""
         still = self.still
         angles = Grid((IMAGE_PIXELS, IMAGE_PIXELS), wavelength_m / still.shape.diameter_m / 2)
         pupil = _middle(still.shape.on(still.light), self.weights.shape)
-        return LongExposure.init(pupil, wavelength_m=wavelength_m, pixel_m=still.light.pixel_m, angles=angles)
+        scale = {"wavelength_m": wavelength_m, "pixel_m": still.light.pixel_m, "angles": angles}
+        return LongExposure.init(pupil, **scale, coronagraph=coronagraph)
 
     def air_m(self, frame: int) -> Float[Array, "lit_y lit_x"]:
         """The wavefront of the air in the middle of an exposure, without piston."""
@@ -119,8 +128,9 @@ class LoopLight(eqx.Module):
             opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
             whole_m = still.on_light(opd_m)
             images = self.optics.images(opd_m, share * still.photons)
-            square = jnp.sum(self.weights * opd_m**2)
-            return (sums[0] + whole_m * share, sums[1] + images, sums[2] + square * share, sums[3].add(opd_m)), None
+            left_m = opd_m - self.reference_m
+            square = jnp.sum(self.weights * left_m**2)
+            return (sums[0] + whole_m * share, sums[1] + images, sums[2] + square * share, sums[3].add(left_m)), None
 
         dark = jax.eval_shape(lambda opd_m: self.optics.images(opd_m, still.photons), self.weights)
         dtype = self.weights.dtype
@@ -150,6 +160,7 @@ def sequence_config(config: Config) -> Config:
     carried_m = max(sky.wind_speeds_m_per_s) * loop.seconds
     width_m = max(SCREEN_DIAMETERS * config.beam.diameter_m, carried_m + 4 * config.beam.diameter_m)
     air = {"screen_width_m": sky.screen_width_m or width_m}
+    config = with_planes_of_sensor(config)
     time = {"rate_hz": loop.rate_hz, "frames": loop.frames, "substeps": loop.substeps}
     return config.model_copy(
         update={
@@ -157,6 +168,43 @@ def sequence_config(config: Config) -> Config:
             "simulation": config.simulation.model_copy(update=time),
         }
     )
+
+
+def with_planes_of_sensor(config: Config) -> Config:
+    """The same, with the planes of the linear curvature sensor where that one measures.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> with_planes_of_sensor(load_config(None, ["loop.sensor=linear-curvature"])).curvature_sensor.distances_km
+        (-1000.0, 1000.0)
+    """
+    if config.loop.sensor != "linear-curvature":
+        return config
+    planes = CurvatureSensorSettings(distances_km=config.linear_curvature.distances_km)
+    return config.model_copy(update={"curvature_sensor": planes})
+
+
+def reference_wavefront_m(
+    config: Config, weights: Float[np.ndarray, "lit_y lit_x"], grid: Grid
+) -> Float[np.ndarray, "lit_y lit_x"]:
+    """What the sensor sees when the star's image is flat, without piston; zero where there is no light.
+
+    Args:
+        config: The settings.
+        weights: Share of the light in every cell.
+        grid: The cells.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> tilted = load_config(None, ["loop.reference_nm=[0, 40]", "beam.diameter_m=2"])
+        >>> one = reference_wavefront_m(tilted, np.full((4, 4), 1 / 16), Grid((4, 4), 0.25))
+        >>> (1e9 * one[:, 0]).round(1).tolist()  # twice the height over the radius, of 40 nm
+        [-30.0, -10.0, 10.0, 30.0]
+    """
+    wave_m = 1e-9 * np.array([0.0, *config.loop.reference_nm])
+    shapes = zernikes(len(wave_m), grid, diameter_m=config.beam.diameter_m)
+    summed = np.tensordot(wave_m, np.asarray(shapes, float), axes=1)
+    return np.where(weights > 0, summed - np.sum(weights * summed), 0)
 
 
 def _middle(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -77,11 +77,14 @@ class Loop:
         measurement: Sensor and reconstructor.
         controller: From measurements to commands.
         basis: Modes on the detector's pixels, for the groups.
+        reference_m: Modes that are left on the sensor.
     """
 
     def __init__(self, config: Config, *, light: LoopLight, measurement: LoopSensor, controller: Controller) -> None:
         self.config, self.light, self.measurement, self.controller = config, light, measurement, controller
         self.basis = pixel_basis(light)
+        self.reference_m = light.mirror.fitted(light.reference_m)
+        self._science_m = light.still.on_pixels(light.still.on_light(light.reference_m))
         self._groups = jax.jit(self._group_squares)
 
     @classmethod
@@ -105,7 +108,7 @@ class Loop:
         """Before the first exposure: the mirror flat, or with the shape of the air."""
         control = self.controller.init()
         if self.config.loop.start == "closed":
-            command_m = self.light.mirror.fitted(self.light.air_m(0))
+            command_m = self.light.mirror.fitted(self.light.air_m(0)) - self.reference_m
             for _ in range(control.line.commands_m.shape[0]):
                 control = control.push(command_m)
         image = self.light.star_image(self.config.loop.science_wavelength_um * 1e-6)
@@ -123,6 +126,7 @@ class Loop:
             command_m, memory = self.measurement.skip(state.memory)
         else:
             sight, memory = self._measured(arrived, line.mean_m, state.memory)
+            sight = sight._replace(residual_m=sight.residual_m - self.reference_m)
             command_m = sight.command_m
         control = self._commanded(state.control, sight, command_m)
         closed_at = state.closed_at
@@ -143,7 +147,7 @@ class Loop:
     def _commanded(self, control: FeedbackState, sight: Sight | None, command_m: Array | None) -> FeedbackState:
         """The next command on its way: that of a sensor that looks ahead, or the controller's."""
         if command_m is not None:
-            return control.push(command_m)
+            return control.push(command_m - self.reference_m)
         if sight is None or sight.outcome in (Outcome.NO_LIGHT, Outcome.NOT_FINITE):
             return self.controller.skip(control)[0]
         return self.controller.step(control, sight.residual_m)[0]
@@ -179,7 +183,7 @@ class Loop:
         return self.measurement.measure(clean, usable, self.light.mirror.opd_m(command_m), memory)
 
     def _group_squares(self, truth_m: Float[Array, "y x"]) -> Float[Array, "5"]:
-        groups = rms_groups(jnp.nan_to_num(truth_m), self.basis)
+        groups = rms_groups(jnp.nan_to_num(truth_m - self._science_m), self.basis)
         return jnp.stack([getattr(groups, f"{name}_m") for name in GROUPS]) ** 2
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.wind import Wind
 from nlcwfs.feedback.controller import Telemetry
+from nlcwfs.simulation.closed_loop.handover import MatrixLook
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.loop import GROUPS, Loop, LoopState, Record
 
@@ -36,6 +37,7 @@ class LoopTelemetry(NamedTuple):
         outcome: How it ended, see `Outcome`; `MISSING` where nothing arrived.
         ffts: FFTs of one plane.
         closed: Whether the frame was followed.
+        linear: Whether the matrix of the linear regime has read it.
         measured_m: Residual of the mirror's modes that was measured, less what was not believed.
         command_m: Mean command on the mirror.
     """
@@ -46,6 +48,7 @@ class LoopTelemetry(NamedTuple):
     outcome: Int[np.ndarray, " frame"]
     ffts: Int[np.ndarray, " frame"]
     closed: np.ndarray
+    linear: np.ndarray
     measured_m: Float[np.ndarray, "frame mode"]
     command_m: Float[np.ndarray, "frame mode"]
 
@@ -61,6 +64,7 @@ class LoopTelemetry(NamedTuple):
             outcome=np.array([MISSING if one is None else int(one.outcome) for one in sights]),
             ffts=np.array([0 if one is None else one.ffts for one in sights]),
             closed=np.array([one is not None and one.closed for one in sights]),
+            linear=np.array([one is not None and one.linear for one in sights]),
             measured_m=np.stack([flat if one is None else np.asarray(one.residual_m) for one in sights]),
             command_m=np.stack([record.command_m for record in records]),
         )
@@ -136,12 +140,22 @@ def summary(loop: Loop, state: LoopState, records: Sequence[Record], seconds: fl
         "frames_counted": len(counted),
         "frames_to_close": None if state.closed_at < 0 else int(state.closed_at),
         "frames_not_believed": int(np.sum(~believed)),
+        "frames_linear": int(np.sum(told.linear)),
+        "handovers": int(np.sum(np.diff(told.linear.astype(int)) > 0)),
+        "handbacks": int(np.sum(np.diff(told.linear.astype(int)) < 0)),
+        "linear_range_nm": told_range_nm(loop),
         "ffts_per_frame": float(np.median(told.ffts[first:])) if len(counted) else None,
         "wind": told_wind(loop),
         "latency_s": loop.config.feedback.latency_frames / settings.rate_hz,
         "seconds": round(seconds, 2),
         "bounds": bounds,
     }
+
+
+def told_range_nm(loop: Loop) -> float | None:
+    """Rms of the residual up to which the matrix of a loop serves; None of a loop without."""
+    linear: MatrixLook | None = getattr(loop.measurement, "linear", None)
+    return None if linear is None else round(1e9 * linear.matrix.range.limit_m, 1)
 
 
 def told_wind(loop: Loop) -> dict[str, float] | None:

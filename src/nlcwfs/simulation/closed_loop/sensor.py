@@ -10,7 +10,10 @@ from nlcwfs.simulation.closed_loop.flow import carried_curvature
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
 from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.linear_images import handed_over
 from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature, IdealMeasurement, SingleFrames
+from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
+from nlcwfs.simulation.closed_loop.pyramid_sensor import FollowedPyramid
 from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
 
@@ -62,8 +65,12 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     if config.feedback.controller == "kalman" and not carries:
         rule = "filters the air of loop.sensor = shack-hartmann, or of curvature with method = map and loop.follow"
         raise SettingsError("feedback.controller", rule, "kalman")
+    if loop.sensor == "linear-curvature" or loop.handover:
+        return handed_over(config, light)
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
+    if isinstance(light.optics, PyramidOptics):
+        return FollowedPyramid.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)
     if method == "map" and loop.follow:

@@ -1,6 +1,6 @@
 """What a user may choose about a closed loop."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,10 +25,22 @@ class LoopSettings(BaseModel):
         le=1000,
         description="Moments of an exposure, evenly spread, whose light is summed while the air moves.",
     )
-    sensor: Literal["curvature", "ideal", "shack-hartmann"] = Field(
+    sensor: Literal["curvature", "ideal", "linear-curvature", "pyramid", "shack-hartmann"] = Field(
         default="curvature",
         description="What measures: the curvature sensor with the method of [estimation], an ideal sensor that sees "
-        "the mean wavefront without noise, or the lenslets of [shack_hartmann].",
+        "the mean wavefront without noise, the planes of [linear_curvature] with matrices alone, the prism of "
+        "[pyramid], or the lenslets of [shack_hartmann].",
+    )
+    handover: bool = Field(
+        default=False,
+        description="Whether the curvature sensor is read by one matrix product a frame while its residual is small "
+        "enough; else the method of [estimation] works.",
+    )
+    reference_nm: tuple[Annotated[float, Field(ge=-1e5, le=1e5)], ...] = Field(
+        default=(),
+        examples=[(0.0, 0.0, 30.0)],
+        description="Wavefront that the loop leaves on its sensor so that the star's image is flat: coefficients of "
+        "Zernike polynomials from Noll 2 on. None for the same wavefront on both.",
     )
     start: Literal["open", "closed"] = Field(
         default="open", description="Whether the mirror is flat at first, or already has the shape of the air."
@@ -59,7 +71,7 @@ class LoopSettings(BaseModel):
     fault: Literal["none", "nan-frames", "lost-frames", "doubled-frames", "dead-plane", "bump"] = Field(
         default="none",
         description="What goes wrong on purpose: frames of NaN, frames that do not come, old frames again, the first "
-        "plane dark (or a quarter of the spots), or a bump in the wavefront that stays.",
+        "plane dark (or a pupil image, or a quarter of the spots), or a bump in the wavefront that stays.",
     )
     fault_at_s: float = Field(default=0.5, ge=0, description="When it begins.")
     fault_s: float = Field(default=0.05, gt=0, description="How long it lasts.")

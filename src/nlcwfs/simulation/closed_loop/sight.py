@@ -29,6 +29,7 @@ class Sight(NamedTuple):
         closed: Whether the frame was followed from the one before.
         command_m: The air of the exposure in which the next command acts, in commands; None from a sensor that does
             not look ahead.
+        linear: Whether the matrix of the linear regime has made it.
     """
 
     residual_m: Float[Array, " mode"]
@@ -37,6 +38,7 @@ class Sight(NamedTuple):
     ffts: int
     closed: bool
     command_m: Float[Array, " mode"] | None = None
+    linear: bool = False
 
 
 class PixelModes(eqx.Module):

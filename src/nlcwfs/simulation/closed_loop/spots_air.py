@@ -15,9 +15,10 @@ from nlcwfs.feedback.controller import Telemetry
 from nlcwfs.simulation.closed_loop.air import learnt_air, unit_variance_m2
 from nlcwfs.simulation.closed_loop.carried_spots import CarriedSpots, SpotsAir
 from nlcwfs.simulation.closed_loop.flow import AT_LEAST, BEYOND, CELLS
-from nlcwfs.simulation.closed_loop.lenslet_modes import PERIOD, slopes_of_cells, waves_between
+from nlcwfs.simulation.closed_loop.lenslet_modes import slopes_of_cells
 from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
 from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.loop_waves import PERIOD, waves_between
 
 FINE = 4.0
 """Cells for each cycle of the finest mode, at least, where the air's covariance is computed. Measured, D/d = 36 at 420

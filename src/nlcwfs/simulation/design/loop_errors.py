@@ -177,10 +177,8 @@ def best_of_rates(left_m: Callable[[float], float]) -> float:
         400.0
     """
     low, high = np.log(RATES_HZ)
-    found = scipy.optimize.minimize_scalar(
-        lambda log_hz: left_m(math.exp(log_hz)), bounds=(low, high), method="bounded", options={"xatol": 0.02}
-    )
-    return float(f"{math.exp(found['x']):.2g}")
+    log_hz = float(scipy.optimize.fminbound(lambda one: left_m(math.exp(one)), low, high, xtol=0.02))
+    return float(f"{math.exp(log_hz):.2g}")
 
 
 def _summed(information: PlaneInformation, planes: Planes) -> list[Float[np.ndarray, "mode mode"]]:

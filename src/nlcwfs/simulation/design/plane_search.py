@@ -82,6 +82,5 @@ def _split(information: PlaneInformation, distances_m: tuple[float, ...], rate_h
     def left_m(near: float) -> float:
         return loop_errors(information, Planes(distances_m, (near, 1 - near)), rate_hz=rate_hz).photon_m
 
-    found = scipy.optimize.minimize_scalar(left_m, bounds=(0.1, 0.9), method="bounded", options={"xatol": 0.02})
-    near = round(float(found["x"]), 2)
+    near = round(float(scipy.optimize.fminbound(left_m, 0.1, 0.9, xtol=0.02)), 2)
     return near, round(1 - near, 2)
