@@ -177,8 +177,8 @@ def best_of_rates(left_m: Callable[[float], float]) -> float:
         400.0
     """
     low, high = np.log(RATES_HZ)
-    log_hz = float(scipy.optimize.fminbound(lambda one: left_m(math.exp(one)), low, high, xtol=0.02))
-    return float(f"{math.exp(log_hz):.2g}")
+    found = scipy.optimize.fminbound(lambda one: left_m(math.exp(one)), low, high, xtol=0.02)
+    return float(f"{math.exp(float(np.ravel(found)[0])):.2g}")
 
 
 def _summed(information: PlaneInformation, planes: Planes) -> list[Float[np.ndarray, "mode mode"]]:

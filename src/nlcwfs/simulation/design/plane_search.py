@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import scipy.optimize
 
 from nlcwfs.simulation.design.loop_errors import Planes, loop_errors
@@ -82,5 +83,5 @@ def _split(information: PlaneInformation, distances_m: tuple[float, ...], rate_h
     def left_m(near: float) -> float:
         return loop_errors(information, Planes(distances_m, (near, 1 - near)), rate_hz=rate_hz).photon_m
 
-    near = round(float(scipy.optimize.fminbound(left_m, 0.1, 0.9, xtol=0.02)), 2)
+    near = round(float(np.ravel(scipy.optimize.fminbound(left_m, 0.1, 0.9, xtol=0.02))[0]), 2)
     return near, round(1 - near, 2)
