@@ -273,7 +273,7 @@ def design(
 ) -> None:
     """Design a sensor: planes, light split, pixels, window and rate for a telescope, star, air and mirror.
 
-    Writes settings for nlcwfs loop, a table and a figure; ends with 2 when a requirement cannot be met. A minute or two.
+    Writes settings for nlcwfs loop, a table and a figure; ends with 2 when a requirement cannot be met.
     """
     from nlcwfs.commands.design import design as run
     from nlcwfs.config import load_config
