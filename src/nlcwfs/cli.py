@@ -271,16 +271,14 @@ def design(
 ) -> None:
     """Design a sensor: planes, light split, pixels, window and rate for a telescope, star, air and mirror.
 
-    Two or three minutes. Writes settings ready for nlcwfs loop, a table and a figure, and tells what rms to expect.
-    Ends with 2 when a requirement cannot be met.
+    Writes settings for nlcwfs loop, a table and a figure; ends with 2 when a requirement cannot be met.
     """
     from nlcwfs.commands.design import design as run
     from nlcwfs.config import load_config
     from nlcwfs.simulation.design.requirements import Wishes
 
-    wishes = Wishes(planes, window, pixels, rate, rms_nm, keep_planes)
-    chosen = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
-    raise typer.Exit(run(load_config(config, chosen), wishes, out, quiet=quiet))
+    chosen = load_config(config, [*(settings or []), *([] if seed is None else [f"seed={seed}"])])
+    raise typer.Exit(run(chosen, Wishes(planes, window, pixels, rate, rms_nm, keep_planes), out, quiet=quiet))
 
 
 def main() -> None:

@@ -66,6 +66,8 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.simulation.closed_loop.run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",
     "nlcwfs.simulation.closed_loop.run:summary": "needs a run of the loop",
     "nlcwfs.simulation.closed_loop.run:loop_bounds": "needs a loop",
+    "nlcwfs.simulation.design.design:design": "half a minute; `nlcwfs design` and docs/design.md show it",
+    "nlcwfs.studies.design_picture:draw_design": "needs a design",
     "nlcwfs.studies.contrast_loop:run_behind_coronagraph": "needs a loop, and seconds; docs/contrast.md shows it",
     "nlcwfs.studies.contrast_loop:measured_flux_factor": "needs a loop that has run",
     "nlcwfs.studies.contrast_loop:measured_contrast": "the same",

@@ -38,7 +38,8 @@ class CurvatureSensorSettings(BaseModel):
 
     @model_validator(mode="after")
     def _planes_agree(self) -> "CurvatureSensorSettings":
-        if self.defocus_waves is not None and "distances_km" in self.model_fields_set:
+        default = type(self).model_fields["distances_km"].default  # a file of all defaults does not choose them
+        if self.defocus_waves is not None and self.distances_km != default:
             raise ValueError("defocus_waves must be left out with distances_km: they say the same in other words")
         name = "distances_km" if self.defocus_waves is None else "defocus_waves"
         places = self.distances_km if self.defocus_waves is None else self.defocus_waves

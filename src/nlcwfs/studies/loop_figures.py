@@ -1,5 +1,6 @@
 """Figures of sweeps of the loop: what is left at each rate, of each star, in each case, and the star's image."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,9 @@ RATE, MAGNITUDE = "loop.rate_hz", "atmosphere.star.magnitude"
 
 LEAST_RATES = 3
 """Fewer are no curve."""
+
+LONGEST_LABEL = 14
+"""Letters of a case's name in a line; it is broken at its hyphens."""
 
 
 def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
@@ -87,7 +91,8 @@ def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
         if len(floors):
             axes.plot([place - 0.3, place + 0.3], [np.median(floors)] * 2, "--", color="0.4", linewidth=1)
     axes.set_xlim(-0.5, len(names) - 0.5)
-    axes.set_xticks(range(len(names)), [f"{name}\n{_closed_of(members)}" for name, members in cases.items()])
+    labels = [f"{textwrap.fill(name, LONGEST_LABEL)}\n{_closed_of(members)}" for name, members in cases.items()]
+    axes.set_xticks(range(len(names)), labels)
     _residual_axis(axes)
     axes.legend(fontsize=8, frameon=False)
     return figure

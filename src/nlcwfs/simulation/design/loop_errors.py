@@ -103,6 +103,7 @@ def errors_with(
 
         >>> from nlcwfs.atmosphere.phase_screen import Turbulence
         >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> from nlcwfs.simulation.design.loop_residual import Loop
         >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
         >>> left = LoopResidual.build(small, PupilShape(1.0))
         >>> found = errors_with(left, [4 * np.eye(left.basis.count)], rate_hz=500.0)
@@ -176,10 +177,8 @@ def best_of_rates(left_m: Callable[[float], float]) -> float:
         400.0
     """
     low, high = np.log(RATES_HZ)
-    found = scipy.optimize.minimize_scalar(
-        lambda log_hz: left_m(math.exp(log_hz)), bounds=(low, high), method="bounded", options={"xatol": 0.02}
-    )
-    return float(f"{math.exp(found['x']):.2g}")
+    found = scipy.optimize.fminbound(lambda one: left_m(math.exp(one)), low, high, xtol=0.02)
+    return float(f"{math.exp(float(np.ravel(found)[0])):.2g}")
 
 
 def _summed(information: PlaneInformation, planes: Planes) -> list[Float[np.ndarray, "mode mode"]]:

@@ -129,7 +129,7 @@ class LoopResidual:
             >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
             >>> left = LoopResidual.build(small, PupilShape(1.0)).redrawn(rate_hz=500.0, draws=2, seed=0)
             >>> left.controlled, left.draws_rad.shape
-            (43, (2, 18, 18))
+            (42, (2, 18, 18))
         """
         sensed = min(loop.cutoff_cpa, FINEST_CPA)
         cells = 2 * math.ceil(CELLS_PER_CYCLE * max(sensed, 4.0) / 2)

@@ -74,6 +74,16 @@ def choices(
         pixels: Detectors.
         rate_hz: Exposures in a second.
         dark_share: See `PlaneInformation`.
+
+    Examples:
+        >>> from nlcwfs.atmosphere.phase_screen import Turbulence
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
+        >>> left = LoopResidual.build(small, PupilShape(1.0)).redrawn(rate_hz=500.0, draws=1, seed=0)
+        >>> both = [Pixels(12, 18), Pixels(12, 36)]
+        >>> usual, wide = choices(left, Planes.evenly(3e4), pixels=both, rate_hz=500.0, dark_share=0.0)
+        >>> usual.caught < wide.caught, usual.errors.photon_m > wide.errors.photon_m
+        (True, True)
     """
     told = []
     for one in pixels:

@@ -83,6 +83,18 @@ def check_possible(residual: LoopResidual, wishes: Wishes, *, rate_hz: float, im
 
     Raises:
         SettingsError: If a requirement cannot be met; the message says by how much.
+
+    Examples:
+        >>> from nlcwfs.atmosphere.phase_screen import Turbulence
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> from nlcwfs.simulation.design.loop_residual import Loop
+        >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
+        >>> left = LoopResidual.build(small, PupilShape(1.0))
+        >>> check_possible(left, Wishes(pixels=4), rate_hz=500.0, images=4)
+        >>> check_possible(left, Wishes(pixels=4), rate_hz=500.0, images=2)
+        Traceback (most recent call last):
+        ...
+        nlcwfs.errors.SettingsError: --pixels: must be at least 6 for the 42 modes of the mirror on 2 images, got 4
     """
     pixels = wishes.pixels
     if pixels is not None and images * np.pi / 4 * pixels**2 < residual.controlled:
@@ -129,6 +141,17 @@ def check_rms(residual: LoopResidual, errors: LoopErrors, wishes: Wishes) -> Non
 
     Raises:
         SettingsError: If more is expected to be left; the message says what limits.
+
+    Examples:
+        >>> from nlcwfs.atmosphere.phase_screen import Turbulence
+        >>> from nlcwfs.beam.pupil_shape import PupilShape
+        >>> from nlcwfs.simulation.design.loop_residual import Loop
+        >>> small = Loop(Turbulence(0.2), 1.0, 0.85e-6, 4.0, 10.0, 1.0, photons_per_s=1e6)
+        >>> left = LoopResidual.build(small, PupilShape(1.0))
+        >>> check_rms(left, ideal_errors(left, rate_hz=500.0), Wishes(rms_nm=20.0))
+        Traceback (most recent call last):
+        ...
+        nlcwfs.errors.SettingsError: --rms-nm: must be at least 28.4: the mirror cannot make ... leave 20), got 20.0
     """
     if wishes.rms_nm is None or errors.total_m * 1e9 <= wishes.rms_nm:
         return
