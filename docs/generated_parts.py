@@ -17,6 +17,7 @@ STUDIES = (
     "06-sensitivity",
     "07-contrast",
     "08-planes-and-pixels",
+    "09-one-family",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 

@@ -176,7 +176,7 @@ def test_cells_that_are_too_coarse_are_refused():
     rule = "must be at most that of a detector pixel, 0.25 m, got 0.5"
     assert str(refusal.value) == f"pyramid.grid.pixel_m: {rule}"
     with pytest.raises(SamplingError) as refusal:
-        sensor_on(Grid((16, 16), 0.5), pixels=8, modulation_lambda_over_d=5.0)
+        sensor_on(Grid((16, 16), 0.5), pixels=8, modulation_lambda_over_d=5.0, modulation_points=40)
     rule = "must be at most 4 on cells of 0.5 m, got 5.0"
     assert str(refusal.value) == f"pyramid.modulation_lambda_over_d: {rule}"
 

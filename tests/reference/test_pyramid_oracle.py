@@ -62,7 +62,7 @@ def windows(frame: np.ndarray, margin: int) -> np.ndarray:
 
 @pytest.mark.parametrize("modulation", [0.0, 2.5])
 def test_hcipy_sees_the_same_images(modulation):
-    grid, margin, points = Grid((CELLS, CELLS), CELL_M), 8, 8
+    grid, margin, points = Grid((CELLS, CELLS), CELL_M), 8, 20
     pupil = PupilShape(DIAMETER_M, 0.3).on(grid) * (1 - 0.5 * np.arange(CELLS) / CELLS)  # brighter at the left
     opd_m = rough(grid)
     sensor = Pyramid.build(
