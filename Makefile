@@ -44,6 +44,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sensitivity studies/07-contrast/sensors
 	$(BIN)/nlcwfs contrast studies/07-contrast/loop.toml --loop --out studies/07-contrast
 	$(BIN)/nlcwfs contrast studies/07-contrast/contrast.toml --out studies/07-contrast
+	$(BIN)/nlcwfs sweep studies/08-planes-and-pixels
 	$(BIN)/nlcwfs sensitivity studies/09-one-family
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 

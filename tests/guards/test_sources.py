@@ -77,7 +77,6 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.studies.sensitivity_run:rows_of_points": "needs a table of curves",
     "nlcwfs.studies.sensitivity_figure:draw_sensitivity": "needs a table of curves",
     "nlcwfs.studies.sensitivity_figure:write_sensitivity_page": "needs a table of curves",
-    "nlcwfs.studies.contrast_loop:run_behind_coronagraph": "needs a loop, and minutes; docs/contrast.md shows it",
     "nlcwfs.studies.sweep_points:read_sweep": "needs a file; docs/sweeps.md shows it",
     "nlcwfs.studies.sweep_cluster:connected": "needs a scheduler; docs/sweeps.md shows it",
     "nlcwfs.studies.sweep_run:run_sweep": "needs workers, and minutes",
