@@ -32,7 +32,7 @@ def test_a_question_becomes_table_figure_and_page_and_is_not_computed_twice(tmp_
     folder = asked(tmp_path / "s")
     result = type_in("sensitivity", folder)
     assert result.exit_code == 0, result.output
-    assert "3 curves, 0 done before." in result.output
+    assert "Curves: 3, 0 done before." in result.output
     table = Table.read(folder / "results.ecsv")
     assert len(table) == 6  # two planes, one near; two ripples each
     assert set(table["sensor"]) == {"planes", "near, linear"}
@@ -41,7 +41,7 @@ def test_a_question_becomes_table_figure_and_page_and_is_not_computed_twice(tmp_
     assert (folder / "sensitivity.png").stat().st_size > 10_000
     assert (folder / "README.md").read_text(encoding="utf-8").startswith("# This one")
     again = type_in("sensitivity", folder)
-    assert "3 curves, 3 done before." in again.output
+    assert "Curves: 3, 3 done before." in again.output
     assert len(Table.read(folder / "results.ecsv")) == 6
 
 

@@ -54,7 +54,7 @@ def sensitivity(options: SensitivityOptions) -> int:
     _make(folder)
     table = table_of(folder)
     missing = missing_curves(points, table)
-    say(f"{len(points)} curves, {len(points) - len(missing)} done before.", quiet=options.quiet)
+    say(f"Curves: {len(points)}, {len(points) - len(missing)} done before.", quiet=options.quiet)
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     silent = options.quiet or not console.is_terminal

@@ -84,13 +84,16 @@ def answer(study: ContrastStudy) -> str:
         >>> answer(ContrastStudy.of(config))  # 2.1 to the power 2/3
         'At 200 mas the halo behind the ideal sensor is 1.64 times fainter than that behind curvature, each at its ...'
     """
-    angles = ", ".join(f"{angle:.3g}" for angle in study.told_mas)
     last = told_rows(study)[-1]
+    told = [(f"{mas:.3g}", text) for mas, text in zip(study.told_mas, last[2:], strict=True) if text != BLIND]
+    if not told:
+        return f"The {last[0]} sensor, or the one that it is compared with, sees no wave that is told here"
+    angles, texts = (", ".join(part) for part in zip(*told, strict=True))
     if len(study.sensors) == 1:
-        return f"At {angles} mas the {last[0]} sensor leaves a halo of {', '.join(last[2:])} at its best rates"
+        return f"At {angles} mas the {last[0]} sensor leaves a halo of {texts} at its best rates"
     first = study.sensors[0].sensor
     return (
-        f"At {angles} mas the halo behind the {last[0]} sensor is {', '.join(last[2:])} times fainter than that "
+        f"At {angles} mas the halo behind the {last[0]} sensor is {texts} times fainter than that "
         f"behind {first}, each at its best rate"
     )
 
