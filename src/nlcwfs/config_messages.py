@@ -12,6 +12,7 @@ from nlcwfs.config_text import toml_key, toml_value
 from nlcwfs.errors import NlcwfsError, SettingsError
 
 _LONGEST_VALUE = 80
+_SLIP = 0.92  # one letter too many in seven
 _SAME_STEM = 0.8  # ratio of difflib: distance and distances are 0.94, wavelength and seeing 0.25
 _NOT_SET = object()
 
@@ -141,8 +142,11 @@ def _section_type(annotation: Any, *, name: str | None = None) -> type[BaseModel
 
 
 def _suggestion(root: type[BaseModel], section: type[BaseModel], key: str) -> str:
-    """Which key the user may have meant: the same name elsewhere, another unit, a near spelling."""
+    """Which key the user may have meant: a slip of a letter, the same name elsewhere, another unit, a near spelling."""
     here, everywhere = list(section.model_fields), dict(_all_keys(root))
+    slip = difflib.get_close_matches(key, here, n=1, cutoff=_SLIP)
+    if slip and not _differ_in_unit(key, slip[0]):
+        return f"did you mean {slip[0]}?"
     for path, name in everywhere.items():
         if name == key:
             return f"did you mean {path}?"
