@@ -45,6 +45,8 @@ def draw_magnitudes(folder: Path, rows: Sequence[Row]) -> Figure | None:
         rows: Of its table.
     """
     curves = {case: at_best_rate(members) for case, members in _by_case(rows).items()}
+    if any(len(told) > 1 for told in curves.values()):  # a single star beside curves is there for its image
+        curves = {case: told for case, told in curves.items() if len(told) > 1}
     return _curves(curves, MAGNITUDE, "magnitude of the star")
 
 
