@@ -149,7 +149,7 @@ def test_a_star_is_told_by_its_magnitude(tmp_path):
         ("loop.rate_hz=2", "loop.rate_hz: must be higher"),
         ("feedback.gain=3", "feedback.gain: must be"),
         ("mirror.cutoff_cpa=40", "mirror.cutoff_cpa"),
-        ("loop.sensor=pyramid", "loop.sensor: must be"),
+        ("loop.sensor=quadcell", "loop.sensor: must be"),
     ],
 )
 def test_settings_that_cannot_be_are_told_in_a_line(tmp_path, setting, rule):

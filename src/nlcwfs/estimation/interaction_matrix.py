@@ -40,8 +40,8 @@ def linearised(
         >>> import jax.numpy as jnp
         >>> wave = jnp.array([0.0, 0.5])
         >>> found = linearised(jnp.sin, wave, np.eye(2, dtype=wave.dtype))
-        >>> found.signal.round(2).tolist(), found.interaction.round(2).tolist()
-        ([0.0, 0.47999998927116394], [[1.0, 0.0], [0.0, 0.8799999952316284]])
+        >>> np.allclose(found.signal, np.sin(wave)), np.allclose(found.interaction, np.diag(np.cos(wave)))
+        (True, True)
     """
     found, push = jax.linearize(signal, reference_m)
     answers = jax.jit(lambda waves: jax.lax.map(push, waves, batch_size=AT_A_TIME))

@@ -116,7 +116,7 @@ def signals(
 
     Examples:
         >>> import jax.numpy as jnp
-        >>> at = signals(lambda opd: 1 + opd**2, jnp.ones((1, 1, 1)), jnp.ones((1, 1, 1, 1)), wavelength_m=2 * np.pi)
+        >>> at = signals(lambda opd: 1 + opd[None] ** 2, jnp.ones((1, 1)), jnp.ones((1, 1, 1)), wavelength_m=2 * np.pi)
         >>> float(at.mean.sum()), float(at.changes.sum())
         (2.0, 2.0)
     """
@@ -131,7 +131,7 @@ def information(seen: Signals) -> Float[np.ndarray, "mode mode"]:
     Examples:
         >>> import jax.numpy as jnp
         >>> image = Signals(jnp.full((1, 1, 1), 0.5), jnp.full((1, 1, 1, 1), 0.5))
-        >>> information(image).tolist()
+        >>> information(image).round(6).tolist()
         [[0.5]]
     """
     weighted = _per_noise(seen.changes, seen.mean)

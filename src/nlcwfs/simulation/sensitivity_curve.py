@@ -74,6 +74,7 @@ def sensitivity_curve(
         SamplingError: If a frequency is too high for the grid.
 
     Examples:
+        >>> from nlcwfs.simulation.sensitivity_settings import LightCells
         >>> case = SensitivityCase(name="planes")
         >>> cells = LightCells(across_pupil=64, window=2.0)
         >>> asked = SensitivityQuestion(question="?", flat=cells, cycles_per_aperture=(4, 8))
