@@ -5,12 +5,13 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import typer
 
-from nlcwfs.errors import NlcwfsError
+from nlcwfs.errors import FileFormatError, NlcwfsError
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells know it: 128 + SIGINT."""
@@ -130,6 +131,18 @@ def device() -> str:
     import jax
 
     return str(jax.devices()[0])
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results, if it is not there.
+
+    Raises:
+        FileFormatError: If it cannot be one.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f"{folder}: must be a folder that can be written, got {error.strerror}") from None
 
 
 def percent(fraction: float) -> str:

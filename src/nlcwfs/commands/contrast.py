@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from nlcwfs.commands.console import device, say, undisturbed, use_precision, warn
+from nlcwfs.commands.console import device, make_folder, say, undisturbed, use_precision, warn
 from nlcwfs.config import Config
-from nlcwfs.errors import FileFormatError, SettingsError
+from nlcwfs.errors import SettingsError
 from nlcwfs.interop import Provenance, atomic_write, check_writable
 from nlcwfs.simulation.closed_loop.loop import LoopState, Record
 from nlcwfs.simulation.closed_loop.run import Watch
@@ -101,10 +101,7 @@ def _of_star(study: ContrastStudy, loops: list[Row]) -> list[Row]:
 
 def _prepare(out: Path) -> None:
     """Make the folder, and refuse one that cannot be written."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{out}: must be a folder that can be written, got {error.strerror}") from None
+    make_folder(out)
     check_writable(out / TABLE)
 
 

@@ -7,9 +7,8 @@ import astropy.units as u
 from astropy.table import Table
 from rich.console import Console
 
-from nlcwfs.commands.console import device, say, undisturbed
+from nlcwfs.commands.console import device, make_folder, say, undisturbed
 from nlcwfs.config import Config, to_toml
-from nlcwfs.errors import FileFormatError
 from nlcwfs.interop import Provenance, atomic_write
 from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.design.design import Design
@@ -30,7 +29,7 @@ def design(config: Config, wishes: Wishes, out: Path, *, quiet: bool) -> int:
     Raises:
         NlcwfsError: If a requirement cannot be met, or the folder cannot be written.
     """
-    _make(out)
+    make_folder(out)
     console = Console(stderr=True)
     with console.status("Designing ...") as status:
         found = propose(config, pupil_of(config), wishes, lambda line: status.update(f"Designing: {line} ..."))
@@ -121,10 +120,3 @@ def _write(found: Design, out: Path, stamp: Provenance) -> None:
     figure = draw_design(found)
     with atomic_write(out / FIGURE) as temporary:
         figure.savefig(temporary, dpi=120)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: must be a folder that can be written, got {error.strerror}") from None

@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from nlcwfs.commands.console import complain, say, undisturbed, warn
-from nlcwfs.errors import FileFormatError, SettingsError
+from nlcwfs.commands.console import complain, make_folder, say, undisturbed, warn
+from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.sensitivity_settings import SensitivityQuestion, read_question
 from nlcwfs.studies.sensitivity_figure import factor_table, write_sensitivity_page
 from nlcwfs.studies.sensitivity_run import curve_points, missing_curves, rows_of_points, run_curve, table_of
@@ -51,7 +51,7 @@ def sensitivity(options: SensitivityOptions) -> int:
     asked = question_of(options)
     folder = options.out or _home(options.study)
     points = curve_points(asked)
-    _make(folder)
+    make_folder(folder)
     table = table_of(folder)
     missing = missing_curves(points, table)
     say(f"Curves: {len(points)}, {len(points) - len(missing)} done before.", quiet=options.quiet)
@@ -127,13 +127,6 @@ def _home(study: Path | None) -> Path:
     if study is None:
         return Path("sensitivity")
     return study if study.is_dir() else study.parent
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: must be a folder that can be written, got {error.strerror}") from None
 
 
 def _account(rows: Sequence[Row], *, quiet: bool) -> None:

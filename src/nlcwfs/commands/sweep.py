@@ -9,8 +9,7 @@ from distributed import Client
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from nlcwfs.commands.console import NOT_A_SUCCESS, complain, say, undisturbed, warn
-from nlcwfs.errors import FileFormatError
+from nlcwfs.commands.console import NOT_A_SUCCESS, complain, make_folder, say, undisturbed, warn
 from nlcwfs.interop import Provenance, check_writable
 from nlcwfs.studies.image_profiles import keep_profiles
 from nlcwfs.studies.study_figures import draw_figures
@@ -54,7 +53,7 @@ def sweep(study: Path, options: SweepOptions) -> int:
     asked, points = read_sweep(study)
     check_figures(sweep_file(study), asked.figures)
     folder = options.out or sweep_file(study).parent
-    _make(folder)
+    make_folder(folder)
     check_writable(folder / TABLE)
     table = StudyTable(folder / TABLE, key="point")
     missing = missing_points(points, table)
@@ -70,13 +69,6 @@ def sweep(study: Path, options: SweepOptions) -> int:
             raise
     with undisturbed():
         return _written(folder, asked, points, table, quiet=options.quiet)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileFormatError(f"{folder}: must be a folder that can be written, got {error.strerror}") from None
 
 
 def _cluster(options: SweepOptions, points: int) -> AbstractContextManager[Client]:
