@@ -101,7 +101,7 @@ class ExposureSimulator(eqx.Module):
         shape, air = round_pupil(config) if shape is None else shape, turbulence(config)
         light = light_grid(config)
         pupil = shape.on(light)
-        cut = _lit_part(pupil)
+        cut = lit_part(pupil)
         window = (config.detector.window_pixels, config.detector.window_pixels)
         weights = light_weights(pupil)
         return cls(
@@ -275,7 +275,7 @@ def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: G
     rms_m = config.curvature_sensor.static_rms_nm * 1e-9
     if rms_m == 0:
         return np.zeros(grid.shape)
-    cut = _lit_part(weights)
+    cut = lit_part(weights)
     screens = PhaseScreens.build(Turbulence(1.0), shape=weights[cut].shape, pixel_m=grid.pixel_m)
     drawn = np.asarray(screens.draw(jax.random.key(config.curvature_sensor.static_seed)), float)
     planes = np.stack([axis[cut] for axis in np.broadcast_arrays(1.0, grid.y_m, grid.x_m)])
@@ -285,8 +285,16 @@ def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: G
     return centred_in(bent * (rms_m / math.sqrt(np.sum(weights[cut] * bent**2))), grid.shape)
 
 
-def _lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
-    """The smallest part of a grid that holds all the light, of which there must be some, and has its centre."""
+def lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
+    """The smallest part of a grid that holds all the light, of which there must be some, and has its centre.
+
+    Raises:
+        SamplingError: If there is no light.
+
+    Examples:
+        >>> lit_part(np.array([[0, 0, 0, 0, 0], [0, 0, 1, 1, 0]]))
+        (slice(0, 2, None), slice(1, 4, None))
+    """
     slices = []
     for size, lit in zip(pupil.shape, (pupil.any(axis=1), pupil.any(axis=0)), strict=True):
         index = np.flatnonzero(lit)
