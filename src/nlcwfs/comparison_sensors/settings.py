@@ -113,8 +113,8 @@ class PyramidSettings(BaseModel):
     )
     reconstructor: Literal["matrix", "map"] = Field(
         default="matrix",
-        description="Matrix: linear, with the gain that the residual leaves; map: once the loop has closed, the most "
-        "likely wavefront behind the images, as [estimation] says (the non-linear pyramid).",
+        description="Matrix: linear, with the gain that the residual leaves; map: the most likely wavefront behind "
+        "the images, expected as [estimation] says (the non-linear pyramid).",
     )
     cutoff_cpa: float | None = Field(
         default=None,

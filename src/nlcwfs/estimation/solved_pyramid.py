@@ -146,5 +146,5 @@ class SolvedPyramid(eqx.Module):
         residual_rad = problem.known_rad + problem.prior.phase_rad(unknown)
         model = problem.expected(residual_rad)
         missed = jnp.where(problem.usable, (problem.counts - model) ** 2 / (model + problem.dark), 0)
-        chi2 = jnp.sum(missed) / jnp.sum(problem.usable)
+        chi2 = jnp.sum(missed) / jnp.sum(problem.usable.astype(missed.dtype))
         return Solved(residual_rad, chi2, self.air.seen(expected, problem, unknown, jnp.sum(self.light)))

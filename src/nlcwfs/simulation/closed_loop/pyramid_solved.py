@@ -1,4 +1,8 @@
-"""The non-linear pyramid in the loop: the matrix closes it, and then the most likely wavefront is followed."""
+"""The non-linear pyramid in the loop: from the first exposure on the most likely wavefront is followed.
+
+The matrix of the linear pyramid gives the first guess, tells from how uneven the light is whether the loop has closed,
+and works where the most likely wavefront does not explain the light.
+"""
 
 import math
 from typing import NamedTuple
@@ -10,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.config import Config
+from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.followed_air import FollowedAir
 from nlcwfs.estimation.ladder import window_shape
 from nlcwfs.estimation.maximum_a_posteriori import TILT_VARIANCE
@@ -42,7 +47,7 @@ class SolvedState(NamedTuple):
 
     Attributes:
         matrix: Of the linear reconstructor.
-        followed: Of the other; None while the loop is open.
+        followed: Of the other; None where it fails.
         doubts: Frames in a row that were not explained.
     """
 
@@ -55,8 +60,8 @@ class SearchingPyramid(eqx.Module):
     """All pixels of four pupil images, and the most likely wavefront behind them.
 
     Attributes:
-        matrix: Closes the loop, and closes it again when the other fails.
-        solver: Follows it then.
+        matrix: Begins, judges, and works when the other fails.
+        solver: Follows.
         pixels: From a wavefront on the detector's pixels of the curvature sensor to commands.
         on_model: From the mirror's shape to the model.
         mirror: The mirror.
@@ -79,6 +84,9 @@ class SearchingPyramid(eqx.Module):
             SamplingError: If the model's cells are too wide for the prism.
         """
         still, settings = light.still, with_wind_of_air(config)
+        if settings.prior.wind_direction_deg is not None:  # see docs: the loop goes astray
+            rule = "must be left out with pyramid.reconstructor = map"
+            raise SettingsError("estimation.prior.wind_direction_deg", rule, settings.prior.wind_direction_deg)
         oversampling, wave_m, diameter_m = settings.map.oversampling, wavelength_m(config), still.shape.diameter_m
         grid = Grid(window_shape(geometry_of(config, still), 1, settings.map.window), still.frame.pixel_m)
         grid = grid.finer(oversampling)
@@ -122,8 +130,6 @@ class SearchingPyramid(eqx.Module):
         sight, matrix = self.matrix.measure(exposure, usable, mirror_m, state.matrix)
         if sight.outcome is Outcome.NO_LIGHT:
             return sight, self.skip(state)[1] or state
-        if state.followed is None and not sight.closed:
-            return sight, SolvedState(matrix, None, 0)
         seen = exposure.frames.electrons, usable, mirror_m
         if state.followed is None:
             solved, residual_m, left_m = self._started(*seen, self.mirror.opd_m(sight.residual_m))
@@ -134,7 +140,7 @@ class SearchingPyramid(eqx.Module):
         if doubts >= DOUBTS or (state.followed is None and not explained):
             return sight, SolvedState(matrix, None, 0)
         outcome = Outcome.CONVERGED if explained else Outcome.NOT_EXPLAINED
-        return Sight(residual_m, outcome, float(left_m), 0, True), SolvedState(matrix, solved.memory, doubts)
+        return Sight(residual_m, outcome, float(left_m), 0, sight.closed), SolvedState(matrix, solved.memory, doubts)
 
     def skip(self, memory: SolvedState | None) -> tuple[None, SolvedState | None]:
         """An exposure later; see `LoopSensor`."""
