@@ -107,8 +107,9 @@ class SequenceReconstructor(eqx.Module):
     @property
     def ffts(self) -> int:
         """FFTs of every frame after the first."""
-        planes = self.solver.level.optics.transfer.shape[1]
-        return fixed_ffts(planes, inner=self.inner, oversampling=self.solver.settings.map.oversampling)
+        level = self.solver.level
+        planes, colours = level.optics.transfer.shape[1], level.colour_count
+        return fixed_ffts(planes, inner=self.inner, oversampling=level.oversampling, colours=colours)
 
     def start(
         self,
