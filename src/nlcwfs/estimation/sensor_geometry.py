@@ -62,7 +62,7 @@ class SensorGeometry:
         return CurvatureSensor.build(
             self.pupil.on(grid),
             grid,
-            distances_m=np.asarray(self.colour_distances_m or self.distances_m),
+            distances_m=np.array(self.colour_distances_m) if self.colour_distances_m else self.distances_m,
             spectrum=self.spectrum,
             star=self.star,
             dtype=dtype,
