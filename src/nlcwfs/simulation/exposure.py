@@ -6,7 +6,6 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import scipy.fft
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -14,13 +13,14 @@ from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import Spiders, light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
-from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
-from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
+from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
-from nlcwfs.errors import SamplingError, SettingsError
+from nlcwfs.errors import SettingsError
+from nlcwfs.simulation.colours import colours_of
+from nlcwfs.simulation.static_aberration import lit_part, static_aberration
 
 SMALLEST_LIGHT = 1e-6
 """Light of a detector pixel, over a fully lit one, below which it has no wavefront."""
@@ -61,6 +61,7 @@ class ExposureSimulator(eqx.Module):
         sensor: The optics on the grid of the light.
         weights: Share of the light in every cell of the pupil, on the grid of the light.
         detector: The camera.
+        wavelength_m: Wavelength of sensing, at which the reconstructor works.
         photons: Photons that the whole sensor gets in one exposure.
         factor: Cells of the light along a detector pixel.
         window: Detector pixels along y and x.
@@ -81,6 +82,7 @@ class ExposureSimulator(eqx.Module):
     sensor: CurvatureSensor
     weights: Float[Array, "y x"]
     detector: Detector
+    wavelength_m: float = eqx.field(static=True)
     photons: float = eqx.field(static=True)
     factor: int = eqx.field(static=True)
     window: tuple[int, int] = eqx.field(static=True)
@@ -104,6 +106,7 @@ class ExposureSimulator(eqx.Module):
         cut = lit_part(pupil)
         window = (config.detector.window_pixels, config.detector.window_pixels)
         weights = light_weights(pupil)
+        colours = colours_of(config, air)
         return cls(
             shape=shape,
             light=light,
@@ -112,14 +115,16 @@ class ExposureSimulator(eqx.Module):
             sensor=CurvatureSensor.build(
                 pupil,
                 light,
-                distances_m=distances_m(config),
-                spectrum=Spectrum.monochromatic(wavelength_m(config)),
+                distances_m=colours.distances_m,
+                spectrum=colours.spectrum,
                 flux_fractions=config.curvature_sensor.flux_fractions,
                 static_opd_m=static_aberration(config, weights, light),
+                star=colours.star,
                 dtype=dtype,
             ),
             weights=jnp.asarray(weights, dtype),
             detector=Detector(config.detector),
+            wavelength_m=wavelength_m(config),
             photons=config.atmosphere.photons,
             factor=config.simulation.light_oversampling,
             window=window,
@@ -265,6 +270,7 @@ def light_grid(config: Config) -> Grid:
         size += 1  # odd around odd, even around even: the centres agree
     pixel_m = config.beam.diameter_m / (detector.pixels_across_pupil * simulation.light_oversampling)
     return Grid((size, size), pixel_m)
+<<<<<<< HEAD
 
 
 def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: Grid) -> Float[np.ndarray, "Y X"]:
@@ -303,3 +309,5 @@ def lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
         margin = int(min(index[0], size - 1 - index[-1]))
         slices.append(slice(margin, size - margin))
     return slices[0], slices[1]
+=======
+>>>>>>> colour
