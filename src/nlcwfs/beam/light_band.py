@@ -85,7 +85,8 @@ class LightBand:
             SettingsError: If there are fewer than two rows, wavelengths do not ascend, or photons are negative or none.
 
         Examples:
-            >>> two = LightBand.tabulated(np.array([0.5, 0.6, 0.61, 0.79, 0.8, 0.9]) * 1e-6, np.array([1, 1, 0, 0, 1, 1.0]))
+            >>> rows_um, photons = np.array([0.5, 0.6, 0.61, 0.79, 0.8, 0.9]), np.array([1, 1, 0, 0, 1, 1.0])
+            >>> two = LightBand.tabulated(1e-6 * rows_um, photons)
             >>> [round(share, 2) for share in two.spectrum(2).shares]
             [0.5, 0.5]
         """
