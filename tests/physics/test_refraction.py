@@ -45,7 +45,7 @@ def test_dispersion_is_ciddors():
 
 @pytest.mark.parametrize(("pressure_hpa", "temperature_k"), [(616.0, 273.15), (1013.25, 288.15)])
 def test_towards_the_horizon_the_curvature_of_the_air_counts(pressure_hpa, temperature_k):
-    """dR/dn = (1 - b) tan Z - (b - (n - 1)) tan^3 Z, b the height of the air over the radius of the Earth (Stone 1996)."""
+    """dR/dn = (1 - b) tan Z - (b - (n - 1)) tan^3 Z, b the height of the air over the Earth's radius (Stone 1996)."""
     site, height = Site(pressure_hpa, temperature_k, 0.3), 0.001254 * temperature_k / 273.15
     thin = 287e-6 * pressure_hpa / 1013.25 * 273.15 / temperature_k  # n - 1 near 1 um
 
