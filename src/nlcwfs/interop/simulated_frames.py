@@ -17,10 +17,10 @@ from nlcwfs.simulation.exposure import (
     Exposure,
     ExposureSimulator,
     distances_m,
-    round_pupil,
     seeing_arcsec,
     wavelength_m,
 )
+from nlcwfs.simulation.telescope import telescope
 
 
 def pupil_of(config: Config) -> PupilShape:
@@ -35,7 +35,7 @@ def pupil_of(config: Config) -> PupilShape:
     """
     beam = config.beam
     if beam.pupil_map is None:
-        return round_pupil(config)
+        return telescope(config)
     return read_pupil_shape(beam.pupil_map, diameter_m=beam.diameter_m)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.pupil import Spiders, light_weights
+from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
@@ -20,7 +20,8 @@ from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
-from nlcwfs.errors import SamplingError, SettingsError
+from nlcwfs.errors import SamplingError
+from nlcwfs.simulation.telescope import telescope
 
 SMALLEST_LIGHT = 1e-6
 """Light of a detector pixel, over a fully lit one, below which it has no wavefront."""
@@ -98,7 +99,7 @@ class ExposureSimulator(eqx.Module):
             SamplingError: If the pupil does not fit in the window.
         """
         dtype = "float64" if config.precision == "double" else "float32"
-        shape, air = round_pupil(config) if shape is None else shape, turbulence(config)
+        shape, air = telescope(config) if shape is None else shape, turbulence(config)
         light = light_grid(config)
         pupil = shape.on(light)
         cut = _lit_part(pupil)
@@ -208,21 +209,6 @@ def wavelength_m(config: Config) -> float:
 def distances_m(config: Config) -> tuple[float, ...]:
     """Signed distance of every plane from the pupil."""
     return tuple(distance_km * 1e3 for distance_km in config.curvature_sensor.distances_km)
-
-
-def round_pupil(config: Config) -> PupilShape:
-    """The round telescope of a configuration.
-
-    Raises:
-        SettingsError: If the configuration names a map instead: reading files is not for this stage.
-    """
-    beam = config.beam
-    if beam.pupil_map is not None:
-        raise SettingsError("beam.pupil_map", "must be read first and handed over as a shape", beam.pupil_map)
-    spiders = None
-    if beam.spider_count:
-        spiders = Spiders.evenly(beam.spider_count, width_m=beam.spider_width_m, first_angle_deg=beam.spider_angle_deg)
-    return PupilShape(beam.diameter_m, beam.obstruction_ratio, spiders)
 
 
 def turbulence(config: Config) -> Turbulence:

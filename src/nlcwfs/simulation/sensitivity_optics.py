@@ -17,9 +17,10 @@ from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.speckle_blur import blurred
-from nlcwfs.simulation.exposure import distances_m, round_pupil, static_aberration, wavelength_m
+from nlcwfs.simulation.exposure import distances_m, static_aberration, wavelength_m
 from nlcwfs.simulation.sensitivity import Optics
 from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
+from nlcwfs.simulation.telescope import telescope
 
 
 def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuestion, air: Turbulence | None) -> Optics:
@@ -59,7 +60,7 @@ def _curvature(config: Config, cells: LightCells, binning: int) -> Optics:
         size += 1
     diameter_m, colour_m = config.beam.diameter_m, wavelength_m(config)
     grid = Grid((size, size), diameter_m / across)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     weights = light_weights(pupil)
     sensor = CurvatureSensor.build(
         pupil,
@@ -90,7 +91,7 @@ def _lenslets(config: Config, air: Turbulence | None) -> Optics:
     settings, diameter_m, colour_m = config.shack_hartmann, config.beam.diameter_m, wavelength_m(config)
     fried_m = diameter_m if air is None else air.fried_at(colour_m)
     grid = lenslet_grid(settings, diameter_m=diameter_m, fried_m=fried_m)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     colours = Spectrum.monochromatic(colour_m)
     sensor = ShackHartmann.build(pupil, grid, diameter_m=diameter_m, spectrum=colours, settings=settings)
 
@@ -114,7 +115,7 @@ def _pyramid(config: Config, cells: LightCells) -> Optics:
     """Four images of the pupil; how turbulence blurs them has no closed form."""
     across, diameter_m, colour_m = cells.across_pupil, config.beam.diameter_m, wavelength_m(config)
     grid = Grid((across, across), diameter_m / across)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     colours = Spectrum.monochromatic(colour_m)
     sensor = Pyramid.build(pupil, grid, diameter_m=diameter_m, spectrum=colours, settings=config.pyramid)
 
