@@ -61,7 +61,7 @@ def test_telescopes_have_the_area_of_their_mirrors(layout, count, wanted_m2):
 
 @pytest.mark.parametrize("layout", [sparse, gmt, keck])
 def test_telescopes_are_their_own_point_reflection(layout):
-    amplitude = layout(spiders=Spiders.evenly(2, width_m=0.2, first_angle_deg=40.0)).amplitude(Grid((200, 200), 0.135))
+    amplitude = layout(spiders=Spiders.evenly(2, width_m=0.2, first_angle_deg=17.0)).amplitude(Grid((200, 200), 0.135))
     np.testing.assert_allclose(amplitude, amplitude[::-1, ::-1], atol=1e-12)
     assert not np.allclose(amplitude, amplitude[::-1], atol=0.1)  # the vane tells up from down
 
@@ -87,8 +87,8 @@ def test_labels_part_the_light_of_the_segments(layout):
     for number in (0, 3, 5):
         alone = Segments((segments.parts[number],)).amplitude(grid)
         foreign = alone[labels != number].sum() / alone.sum()
-        # Rim pixels may lie half on either side: rim / area * pixel / 8 is 0.03 for Keck's mirrors.
-        assert foreign < 0.03
+        # Rim pixels may lie half on either side: rim / area * pixel / 4 is 0.06 for Keck's mirrors.
+        assert foreign < 0.06
         assert (alone[labels == number] > 0.99).sum() > 0.8 * alone.sum()
 
 

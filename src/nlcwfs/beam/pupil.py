@@ -81,7 +81,7 @@ def circular_pupil(
             fraction = fraction * beside_vanes(y_m, x_m, width_m, spiders)
         return fraction
 
-    return pupil_from_map(antialiased(lit, *np.broadcast_arrays(grid.y_m, grid.x_m), grid.pixel_m), grid)
+    return pupil_from_map(_on_grid(lit, grid), grid)
 
 
 def pupil_of_discs(
@@ -107,7 +107,7 @@ def pupil_of_discs(
         discs = (np.hypot(y_m - y0, x_m - x0) - disc_diameter_m / 2 for y0, x0 in centres_m)
         return np.clip(sum(covered(outside_m, width_m) for outside_m in discs), 0, 1)
 
-    return pupil_from_map(antialiased(lit, *np.broadcast_arrays(grid.y_m, grid.x_m), grid.pixel_m), grid)
+    return pupil_from_map(_on_grid(lit, grid), grid)
 
 
 def pupil_from_map(amplitude: np.ndarray, grid: Grid) -> Float[np.ndarray, "y x"]:
@@ -219,6 +219,11 @@ def antialiased(
     x_parts_m = x_m[edge][:, None, None] + steps_m[None, :]
     pupil[edge] = lit(y_parts_m, x_parts_m, part_m).mean(axis=(1, 2))
     return pupil
+
+
+def _on_grid(lit: Callable[[np.ndarray, np.ndarray, float], np.ndarray], grid: Grid) -> np.ndarray:
+    y_m, x_m = np.broadcast_arrays(grid.y_m, grid.x_m)
+    return antialiased(lit, y_m, x_m, grid.pixel_m)
 
 
 def nearest_lit(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:

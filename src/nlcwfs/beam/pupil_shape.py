@@ -64,6 +64,11 @@ class PupilShape:
         cells = points.reshape(grid.shape[0], SUBPIXELS, grid.shape[1], SUBPIXELS)
         return pupil_from_map(cells.mean(axis=(1, 3)), grid)
 
+    @property
+    def is_segmented(self) -> bool:
+        """Whether it has segments, which may have steps between them."""
+        return self.segments is not None or self.label_map is not None
+
     def labels(self, grid: Grid) -> Int[np.ndarray, "y x"] | None:
         """The segment that each pixel belongs to, lit or dark; None for a telescope of one piece.
 

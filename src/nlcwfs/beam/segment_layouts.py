@@ -17,11 +17,11 @@ def sparse(*, spiders: Spiders | None = None) -> Segments:
 
     Examples:
         >>> [round(part.x_m, 2) for part in sparse().parts]
-        [1.98, -1.98, -1.98, 1.98]
+        [2.8, 0.0, -2.8, 0.0]
     """
-    away_m = (8.0 - 2.4) / 2 / math.sqrt(2)
-    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    return Segments(tuple(Segment(y * away_m, x * away_m, 2.4) for y, x in signs), spiders=spiders)
+    away_m = (8.0 - 2.4) / 2
+    places = ((0, 1), (1, 0), (0, -1), (-1, 0))
+    return Segments(tuple(Segment(y * away_m, x * away_m, 2.4) for y, x in places), spiders=spiders)
 
 
 def gmt(*, spiders: Spiders | None = None) -> Segments:

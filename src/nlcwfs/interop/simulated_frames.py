@@ -107,6 +107,7 @@ def frames_of(
         flux_fractions=config.curvature_sensor.flux_fractions,
         seeing_arcsec=seeing_arcsec(simulator.air),
         pupil=simulator.shape.on(grid),
+        segments=simulator.shape.labels(grid),
         background=np.full(grid.shape, background) if background else None,
         truth_m=truth_m if several else truth_m[0],
         source="simulation",

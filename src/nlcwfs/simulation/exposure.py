@@ -21,6 +21,7 @@ from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
 from nlcwfs.errors import SamplingError
+from nlcwfs.simulation.segment_aberrations import SegmentAberrations
 from nlcwfs.simulation.telescope import telescope
 
 SMALLEST_LIGHT = 1e-6
@@ -65,6 +66,7 @@ class ExposureSimulator(eqx.Module):
         photons: Photons that the whole sensor gets in one exposure.
         factor: Cells of the light along a detector pixel.
         window: Detector pixels along y and x.
+        stand: How the segments of the pupil stand; None where they stand still, or there are none.
 
     Examples:
         >>> from nlcwfs.config import load_config
@@ -85,6 +87,7 @@ class ExposureSimulator(eqx.Module):
     photons: float = eqx.field(static=True)
     factor: int = eqx.field(static=True)
     window: tuple[int, int] = eqx.field(static=True)
+    stand: SegmentAberrations | None = None
 
     @classmethod
     def build(cls, config: Config, shape: PupilShape | None = None) -> "ExposureSimulator":
@@ -124,6 +127,7 @@ class ExposureSimulator(eqx.Module):
             photons=config.atmosphere.photons,
             factor=config.simulation.light_oversampling,
             window=window,
+            stand=SegmentAberrations.build(config.beam.segments, shape, light, pupil, dtype=dtype),
         )
 
     @property
@@ -139,7 +143,10 @@ class ExposureSimulator(eqx.Module):
             key: Random key of this frame, see `frame_key`.
         """
         key_sky, key_detector = jax.random.split(key)
-        return self.expose_to(self.on_light(self.screens.draw(key_sky)), key_detector)
+        opd_m = self.on_light(self.screens.draw(key_sky))
+        if self.stand is not None:
+            opd_m = opd_m + self.stand.draw(key)
+        return self.expose_to(opd_m, key_detector)
 
     @eqx.filter_jit
     def expose_to(self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray) -> Exposure:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
 from nlcwfs.detector.read import Detector
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
@@ -19,6 +18,7 @@ from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.unwrapping_basis import unwrapping_basis
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.simulation.exposure import ExposureSimulator, seeing_arcsec, turbulence, wavelength_m
@@ -67,8 +67,7 @@ def build_solver(case: Case, config: Config) -> tuple[Reconstructor, Grid]:
         settings = settings.model_copy(update={"seeing_arcsec": seeing_arcsec(simulator.air)})
     basis = None
     if settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes":
-        pupil = simulator.shape.on(geometry.frame)
-        basis = modal_basis(pupil, geometry.frame, diameter_m=geometry.pupil.diameter_m, count=settings.modes)
+        basis = unwrapping_basis(geometry, simulator.shape.on(geometry.frame), modes=settings.modes)
     return build_reconstructor(geometry, settings, basis=basis), geometry.frame
 
 
