@@ -4,6 +4,7 @@ from collections import Counter
 
 import numpy as np
 
+from nlcwfs.beam.pupil import inside
 from nlcwfs.commands.console import percent
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.interop import FramesFile, WavefrontFile
@@ -11,6 +12,7 @@ from nlcwfs.interop.frame_times import FrameTimes
 from nlcwfs.interop.frames_reconstruction import FramesReconstructor, is_success
 from nlcwfs.interop.mirror_twin import twin_warning
 from nlcwfs.interop.sequence_reconstruction import FOLLOWED
+from nlcwfs.simulation.segment_score import segment_score
 
 FEW_FRAMES = 20
 """Up to here each frame gets a line, beyond only those that failed."""
@@ -97,6 +99,33 @@ def result_lines(wavefront: WavefrontFile, lost: np.ndarray | None) -> list[str]
     if followed:
         lines.append(f"Followed: {followed} frames; reconstructed alone: {int(wavefront.ran.sum()) - followed}.")
     return lines
+
+
+def step_lines(frames: FramesFile, wavefront: WavefrontFile) -> list[str]:
+    """What is known of the steps between segments: modulo the wavelength, and how good where there is a TRUTH."""
+    if frames.segments is None:
+        return []
+    count, nm = int(frames.segments.max()) + 1, frames.wavelength_m * 1e9
+    lines = [f"Segments: {count}. One color tells the steps between them only up to whole wavelengths of {nm:.0f} nm."]
+    good = [number for number, outcome in enumerate(wavefront.outcomes) if is_success(outcome)]
+    if frames.truth_m is None or not good:
+        return lines
+    pupil = np.ones(frames.segments.shape) if frames.pupil is None else frames.pupil
+    weights = np.where(inside(pupil), pupil**2, 0)
+    truths_m = np.broadcast_to(frames.truth_m, wavefront.opd_m.shape)
+    scores = [
+        segment_score(wavefront.opd_m[number] - truths_m[number], weights, frames.segments, wavelength_m=nm * 1e-9)
+        for number in good
+    ]
+    piston_nm, inside_nm = (
+        np.median([getattr(one, name) for one in scores]) * 1e9 for name in ("piston_modulo_m", "inside_m")
+    )
+    off = sum(any(one.turns) for one in scores)
+    return [
+        *lines,
+        f"Steps: error {piston_nm:.2g} nm rms modulo the wavelength, {inside_nm:.1f} nm inside the segments (median, "
+        f"against TRUTH); whole wavelengths off in {off} of {len(scores)} frames.",
+    ]
 
 
 def frame_line(wavefront: WavefrontFile, number: int) -> str:
