@@ -104,12 +104,7 @@ def placed(sensor: CurvatureSensorSettings, beam: BeamSettings) -> CurvatureSens
         least = beam.diameter_m**2 / (8e-6 * beam.wavelength_um * FARTHEST_KM * 1e3)
         rule = f"must be at least {least:.2g} to either side, a plane at {FARTHEST_KM:g} km"
         raise SettingsError("curvature_sensor.defocus_waves", rule, list(waves))
-    return CurvatureSensorSettings(
-        distances_km=distances_km,
-        flux_fractions=sensor.flux_fractions,
-        static_rms_nm=sensor.static_rms_nm,
-        static_seed=sensor.static_seed,
-    )
+    return CurvatureSensorSettings(**{**dict(sensor), "distances_km": distances_km, "defocus_waves": None})
 
 
 def cross_checks(config: Config) -> None:

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 UNITS: Mapping[str, str] = {
     **{unit: unit for unit in ("m", "km", "cm", "mm", "um", "nm", "s", "ms", "us", "deg", "rad", "mrad")},
     **{unit: unit for unit in ("arcsec", "arcmin", "mas", "pixels", "electrons", "photons", "adu", "percent")},
-    **{"hz": "Hz", "khz": "kHz", "mhz": "MHz", "micron": "um", "microns": "um"},
+    **{"hz": "Hz", "khz": "kHz", "mhz": "MHz", "micron": "um", "microns": "um", "k": "K", "hpa": "hPa"},
 }
 """Last words of keys that are units, and how they are printed."""
 

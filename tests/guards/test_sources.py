@@ -63,7 +63,7 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.simulation.known_sensor:geometry_of": "needs a whole configuration",
     "nlcwfs.simulation.closed_loop.pyramid_light:pyramid_on": "needs the light of a loop",
     "nlcwfs.simulation.closed_loop.pyramid_regimes:pyramid_regimes": "the same",
-    "nlcwfs.simulation.exposure:static_aberration": "needs a whole configuration",
+    "nlcwfs.simulation.static_aberration:static_aberration": "needs a whole configuration",
     "nlcwfs.simulation.closed_loop.faults:damaged": "needs an exposure",
     "nlcwfs.simulation.closed_loop.run:run_loop": "needs a loop, and seconds; docs/closed-loop.md shows it",
     "nlcwfs.simulation.closed_loop.run:summary": "needs a run of the loop",

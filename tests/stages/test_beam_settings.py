@@ -3,7 +3,7 @@
 import pydantic
 import pytest
 
-from nlcwfs.beam.settings import BeamSettings
+from nlcwfs.beam.settings import BeamSettings, SpectrumSettings
 
 
 def test_defaults_are_table_1_of_the_paper():
@@ -13,7 +13,8 @@ def test_defaults_are_table_1_of_the_paper():
 
 
 def test_every_key_is_described():
-    assert all(field.description for field in BeamSettings.model_fields.values())
+    assert all(field.description for name, field in BeamSettings.model_fields.items() if name != "spectrum")
+    assert all(field.description for field in SpectrumSettings.model_fields.values())
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,26 @@ def test_a_wrong_value_is_named_by_its_key(key, value):
 def test_a_vane_wider_than_the_telescope_is_refused():
     with pytest.raises(pydantic.ValidationError, match="spider_width_m must be smaller"):
         BeamSettings(spider_count=1, spider_width_m=9.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"shape": "flat"}, "bandwidth_um must be given for light of shape flat"),
+        ({"shape": "black-body"}, "bandwidth_um must be given for light of shape black-body"),
+        ({"shape": "table"}, "table must be given for light of shape table"),
+        ({"bandwidth_um": 0.1, "bandwidth_ratio": 0.1}, "bandwidth_ratio must be left out with bandwidth_um"),
+        ({"bandwidth_ratio": 2.0}, "less than 2"),
+        ({"temperature_k": 0.0}, "greater than 0"),
+        ({"wavelengths": 129}, "less than or equal to 128"),
+    ],
+)
+def test_colours_that_are_not_told_are_refused(values, problem):
+    with pytest.raises(pydantic.ValidationError, match=problem):
+        SpectrumSettings(**values)
+
+
+def test_a_width_is_told_in_two_ways():
+    assert SpectrumSettings(bandwidth_um=0.3).bandwidth_um_at(0.85) == 0.3
+    assert SpectrumSettings(bandwidth_ratio=0.5).bandwidth_um_at(0.65) == pytest.approx(0.325)
+    assert SpectrumSettings().bandwidth_um_at(0.65) == 0

@@ -10,7 +10,7 @@ def pupil_field(
     pupil: Float[Array, "y x"] | Float[np.ndarray, "y x"],
     opd_m: Float[Array, "y x"],
     *,
-    wavelength_m: float,
+    wavelength_m: float | Float[Array, ""],
     photons: float | Float[Array, ""] = 1.0,
 ) -> Complex[Array, "y x"]:
     """The light that a star sends through a pupil, with an aberrated wavefront.

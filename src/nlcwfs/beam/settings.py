@@ -1,9 +1,66 @@
 """What a user may choose about the telescope's pupil and the light."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+
+
+class SpectrumSettings(BaseModel):
+    """The colours of the light that the detector counts; one wavelength unless a shape is chosen.
+
+    Light of shape line has the one wavelength of the reconstructor, beam.wavelength_um, and the other keys do nothing.
+
+    Examples:
+        >>> SpectrumSettings(shape="flat", bandwidth_ratio=0.4).bandwidth_um_at(0.85)
+        0.34
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    shape: Literal["line", "flat", "black-body", "table"] = Field(
+        default="line",
+        description="one wavelength; as many photons at each wavelength of a band around beam.wavelength_um; a black "
+        "body's through that band; or those of a table",
+    )
+    bandwidth_um: float | None = Field(
+        default=None, gt=0, le=30, examples=[0.34], description="width of the band of a flat or a black body's light"
+    )
+    bandwidth_ratio: float | None = Field(
+        default=None,
+        gt=0,
+        lt=2,
+        examples=[0.4],
+        description="instead of bandwidth_um, the width over beam.wavelength_um",
+    )
+    temperature_k: float = Field(default=5800.0, gt=0, le=1e6, description="temperature of a black body")
+    table: Path | None = Field(
+        default=None,
+        examples=["spectrum.ecsv"],
+        description="text file (ECSV or CSV) of two columns, wavelength in um and detected photons per wavelength",
+    )
+    wavelengths: int | None = Field(
+        default=None,
+        ge=1,
+        le=128,
+        examples=[9],
+        description="how many wavelengths stand for the light; leave out for as many as the images need",
+    )
+
+    def bandwidth_um_at(self, wavelength_um: float) -> float:
+        """Width of the band around a wavelength."""
+        return self.bandwidth_um or (self.bandwidth_ratio or 0.0) * wavelength_um
+
+    @model_validator(mode="after")
+    def _shape_is_told(self) -> "SpectrumSettings":
+        if self.bandwidth_um is not None and self.bandwidth_ratio is not None:
+            raise ValueError("bandwidth_ratio must be left out with bandwidth_um: they say the same in other words")
+        if self.shape in ("flat", "black-body") and self.bandwidth_um is None and self.bandwidth_ratio is None:
+            raise ValueError(f"bandwidth_um must be given for light of shape {self.shape}")
+        if self.shape == "table" and self.table is None:
+            raise ValueError("table must be given for light of shape table")
+        return self
 
 
 class SegmentsSettings(BaseModel):
@@ -92,7 +149,13 @@ class BeamSettings(BaseModel):
         description="FITS image of the pupil's amplitude, 0 to 1; replaces circle, obstruction and vanes.",
     )
     segments: SegmentsSettings = Field(default_factory=SegmentsSettings)
-    wavelength_um: float = Field(default=0.85, ge=0.2, le=30, description="Wavelength at which the sensor works.")
+    wavelength_um: float = Field(
+        default=0.85,
+        ge=0.2,
+        le=30,
+        description="Wavelength at which the sensor works: that of the reconstructor, at which distances are quoted.",
+    )
+    spectrum: SpectrumSettings = Field(default_factory=SpectrumSettings)
 
     @model_validator(mode="after")
     def _vanes_fit(self) -> "BeamSettings":
@@ -101,3 +164,9 @@ class BeamSettings(BaseModel):
         if self.segments.layout != "none" and self.pupil_map is not None:
             raise ValueError("pupil_map must be left out with segments.layout")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_colours_that_are_default(self, write: Callable[["BeamSettings"], dict[str, Any]]) -> dict[str, Any]:
+        """Keep the fingerprint of light of one wavelength as it was before there were colours."""
+        values = write(self)
+        return {name: value for name, value in values.items() if name != "spectrum" or self.spectrum.shape != "line"}

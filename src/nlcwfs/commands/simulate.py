@@ -16,6 +16,7 @@ from nlcwfs.errors import SamplingError, SettingsError
 from nlcwfs.interop import FramesFile, Provenance, check_writable, write_frames
 from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.interop.simulated_frames import Shot, frames_of, pupil_of
+from nlcwfs.simulation.colours import colour_account
 from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, frame_key, turbulence, wavelength_m
 from nlcwfs.simulation.sequence import SequenceSimulator, wind_layers
 from nlcwfs.simulation.starlight import starlight_per_s, with_exposures_of
@@ -214,6 +215,7 @@ def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot],
         f"{config.detector.pixels_across_pupil} across the pupil.",
         f"Light: {config.atmosphere.photons:g} photons in one exposure at {colour}; "
         f"{electrons:.0f} electrons were read.",
+        *colour_account(config, simulator.air),
         f"Air: D/r0 = {ratio:.1f} at {colour}; seeing {frames.seeing_arcsec:.2g} arcsec at 0.5 um.",
         f"True wavefront: {np.sqrt(np.mean(np.square(rms_nm))):.0f} nm rms on these pixels, tilt included{spread}.",
         f"Light outside the window: {', '.join(percent(float(share)) for share in lost)} of planes 1 to {planes}.",

@@ -111,6 +111,11 @@ class PyramidSettings(BaseModel):
         le=10,
         description="From the centre of a pupil image to that of its neighbour, in diameters of the image.",
     )
+    reconstructor: Literal["matrix", "map"] = Field(
+        default="matrix",
+        description="Matrix: linear, with the gain that the residual leaves; map: the most likely wavefront behind "
+        "the images, expected as [estimation] says (the non-linear pyramid).",
+    )
     cutoff_cpa: float | None = Field(
         default=None,
         gt=0.5,

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -11,6 +12,7 @@ from nlcwfs.beam.field import pupil_field
 from nlcwfs.beam.fresnel import fresnel_transfer
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.spectrum import Spectrum
+from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.errors import SettingsError
 
 
@@ -34,7 +36,9 @@ class CurvatureSensor(eqx.Module):
 
     Attributes:
         pupil: Amplitude of the pupil, 0 to 1.
-        transfer: Fresnel factor of each colour and plane.
+        transfer: Fresnel factor of each colour and plane; one for all colours where they share it.
+        visibility: What the size of the star leaves of each frequency of an image, by colour or for all; None for a
+            point.
         flux_fractions: Share of the light of each plane.
         static_opd_m: Known aberration in the arm of the sensor, added to the incoming wavefront.
         spectrum: Colours of the light.
@@ -58,6 +62,7 @@ class CurvatureSensor(eqx.Module):
 
     pupil: Float[Array, "y x"]
     transfer: Complex[Array, "colour plane y x"]
+    visibility: Float[Array, "size plane y fx"] | None
     flux_fractions: Float[Array, " plane"]
     static_opd_m: Float[Array, "y x"]
     spectrum: Spectrum = eqx.field(static=True)
@@ -69,10 +74,11 @@ class CurvatureSensor(eqx.Module):
         pupil: Float[np.ndarray, "py px"],
         grid: Grid,
         *,
-        distances_m: Sequence[float],
+        distances_m: Sequence[float] | Float[np.ndarray, "colour plane"],
         spectrum: Spectrum,
         flux_fractions: Sequence[float] | None = None,
         static_opd_m: Float[np.ndarray, "py px"] | None = None,
+        star: ApparentStar = POINT,
         dtype: str = "float32",
     ) -> "CurvatureSensor":
         """Precompute the travel to every plane.
@@ -80,21 +86,22 @@ class CurvatureSensor(eqx.Module):
         Args:
             pupil: Amplitude, 0 to 1, on the grid's pixels; a smaller map is centred in the grid.
             grid: Where the light is computed; wide enough that nothing leaves it, see `beam.sampling`.
-            distances_m: Signed distance of each plane from the pupil, positive downstream.
+            distances_m: Signed distance of each plane from the pupil, positive downstream; a row for each colour where
+                lenses are chromatic, see `curvature_sensor.chromatic_lenses`.
             spectrum: Colours of the light.
             flux_fractions: Share of each plane, sum 1; equal shares when left out.
             static_opd_m: Known aberration in the arm of the sensor, same pixels as the pupil.
+            star: Where each colour comes from, and how large the star is.
             dtype: Precision of the light.
 
         Raises:
             SettingsError: If the planes, the shares or the pupil contradict each other or the grid.
         """
-        distances = tuple(float(distance) for distance in distances_m)
-        if not distances or not np.all(np.isfinite(distances)):
-            raise SettingsError("curvature_sensor.distances_m", "must be finite, at least one", distances)
-        fractions = np.full(len(distances), 1 / len(distances)) if flux_fractions is None else flux_fractions
+        distances = _by_colour(distances_m, spectrum)
+        planes = distances.shape[1]
+        fractions = np.full(planes, 1 / planes) if flux_fractions is None else flux_fractions
         fractions = np.asarray(fractions, float)
-        shared = fractions.shape == (len(distances),) and fractions.min() > 0 and abs(fractions.sum() - 1) <= 1e-6
+        shared = fractions.shape == (planes,) and fractions.min() > 0 and abs(fractions.sum() - 1) <= 1e-6
         if not shared:  # NaN included
             raise SettingsError("curvature_sensor.flux_fractions", "must be one per plane, positive, sum 1", fractions)
         if not np.all(np.isfinite(pupil)):
@@ -103,16 +110,10 @@ class CurvatureSensor(eqx.Module):
         if not np.any(pupil):
             raise SettingsError("pupil", "must let some light through", "zeros everywhere")
         static = np.zeros_like(pupil, float) if static_opd_m is None else static_opd_m
-        transfer = [
-            [
-                fresnel_transfer(grid.shape, distance_m=distance, wavelength_m=colour, pixel_m=grid.pixel_m)
-                for distance in distances
-            ]
-            for colour in spectrum.wavelengths_m
-        ]
         return cls(
             pupil=jnp.asarray(centred_in(pupil, grid.shape), dtype),
-            transfer=jnp.asarray(np.array(transfer), np.result_type(dtype, np.complex64)),
+            transfer=jnp.asarray(_transfer(grid, distances, spectrum, star), np.result_type(dtype, np.complex64)),
+            visibility=None if star.size_rad == 0 else jnp.asarray(_visibility(grid, distances, star), dtype),
             flux_fractions=jnp.asarray(fractions, dtype),
             static_opd_m=jnp.asarray(centred_in(static, grid.shape), dtype),
             spectrum=spectrum,
@@ -130,14 +131,72 @@ class CurvatureSensor(eqx.Module):
             Photons per pixel; over all planes they sum to `photons`.
         """
         opd_m = opd_m.astype(self.static_opd_m.dtype) + self.static_opd_m
-        total = jnp.zeros(self.transfer.shape[1:], opd_m.dtype)
-        for colour, (wavelength_m, share) in enumerate(
-            zip(self.spectrum.wavelengths_m, self.spectrum.shares, strict=True)
-        ):
+        kind, smear = self.transfer.dtype, self.visibility
+        own_smear = smear if smear is not None and len(smear) > 1 else None  # else the sum is smeared, once
+
+        def light_of(wavelength_m, share, transfer, visibility) -> Array:
             near = pupil_field(self.pupil, opd_m, wavelength_m=wavelength_m, photons=share * photons)
-            far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * self.transfer[colour])
-            total = total + self.flux_fractions[:, None, None] * (far.real**2 + far.imag**2)
+            far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * (self.transfer[0] if transfer is None else transfer))
+            light = self.flux_fractions[:, None, None] * (far.real**2 + far.imag**2)
+            return light if visibility is None else jnp.fft.rfft2(light) * visibility.astype(kind)
+
+        wavelengths_m, shares = self.spectrum.wavelengths_m, self.spectrum.shares
+        if len(shares) == 1:
+            total = light_of(wavelengths_m[0], shares[0], None, None)
+        else:
+            own_transfer = self.transfer if len(self.transfer) > 1 else None
+            colours = (jnp.asarray(wavelengths_m, opd_m.dtype), jnp.asarray(shares, opd_m.dtype))
+            shape, dtype = (self.transfer.shape, opd_m.dtype) if own_smear is None else (own_smear.shape, kind)
+            dark, colours = jnp.zeros(shape[1:], dtype), (*colours, own_transfer, own_smear)
+            total = jax.lax.scan(lambda sums, one: (sums + light_of(*one), None), dark, colours)[0]
+        if smear is not None:
+            waves = total if own_smear is not None else jnp.fft.rfft2(total) * smear[0].astype(kind)
+            total = jnp.fft.irfft2(waves, s=opd_m.shape).astype(opd_m.dtype)
         return Planes(total, self.pixel_m)
+
+
+def _by_colour(
+    distances_m: Sequence[float] | Float[np.ndarray, "colour plane"], spectrum: Spectrum
+) -> Float[np.ndarray, "colour plane"]:
+    """The distances of every colour, checked."""
+    distances = np.asarray(distances_m, float)
+    if not distances.size or distances.ndim > 2 or not np.all(np.isfinite(distances)):
+        shown = tuple(map(float, distances)) if distances.ndim == 1 else distances.tolist()
+        raise SettingsError("curvature_sensor.distances_m", "must be finite, at least one", shown)
+    colours = len(spectrum.wavelengths_m)
+    if distances.ndim == 2 and len(distances) != colours:
+        rule = f"must have one row, or one for each of {colours} colours"
+        raise SettingsError("curvature_sensor.distances_m", rule, len(distances))
+    return np.broadcast_to(distances, (colours, distances.shape[-1]))
+
+
+def _transfer(
+    grid: Grid, distances: Float[np.ndarray, "colour plane"], spectrum: Spectrum, star: ApparentStar
+) -> Complex[np.ndarray, "shared plane y x"]:
+    """Fresnel factors; one for all colours if wavelength times distance and the direction are the same."""
+    colours = np.array(spectrum.wavelengths_m)
+    reach = colours[:, None] * distances
+    if star.is_bent and len(star.directions_rad) != len(colours):
+        rule = f"must be one for each of {len(colours)} colours"
+        raise SettingsError("curvature_sensor.star", rule, f"{len(star.directions_rad)} directions")
+    alike = not star.is_bent and bool(np.all(np.abs(reach - reach[0]) <= 1e-15 * np.abs(reach[0])))
+    factors = []
+    for number, wavelength_m in enumerate(colours[:1] if alike else colours):
+        scale = {"wavelength_m": float(wavelength_m), "pixel_m": grid.pixel_m}
+        planes = [fresnel_transfer(grid.shape, distance_m=float(z_m), **scale) for z_m in distances[number]]
+        if star.is_bent:
+            moves = [star.shift(grid, distance_m=float(z_m), colour=number) for z_m in distances[number]]
+            planes = [plane * move for plane, move in zip(planes, moves, strict=True)]
+        factors.append(planes)
+    return np.array(factors)
+
+
+def _visibility(
+    grid: Grid, distances: Float[np.ndarray, "colour plane"], star: ApparentStar
+) -> Float[np.ndarray, "size plane y fx"]:
+    """What is left of the frequencies of the images; one for all colours if their planes are the same."""
+    rows = distances[:1] if np.all(distances == distances[0]) else distances
+    return np.array([[star.visibility(grid, distance_m=float(z_m)) for z_m in row] for row in rows])
 
 
 def centred_in(array: Float[np.ndarray, "py px"], shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:

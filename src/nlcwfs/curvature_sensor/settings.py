@@ -1,7 +1,7 @@
 """What a user may choose about the optics of the sensor."""
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
 
@@ -31,6 +31,17 @@ class CurvatureSensorSettings(BaseModel):
         examples=[(0.3, 0.2, 0.2, 0.3)],
         description="share of the light of each plane, sum 1; leave out for equal shares",
     )
+    lenses: Literal["achromatic", "ideal", "doublet"] = Field(
+        default="achromatic",
+        description="where the planes are in colours other than beam.wavelength_um: at the same distances; at those "
+        "that keep distance times wavelength; or where two glasses put them that come near this",
+    )
+    glasses: tuple[str, ...] = Field(
+        default=("N-FK51A", "N-SF66"),
+        min_length=2,
+        max_length=2,
+        description="the glasses of a doublet, by their names in the catalogue of SCHOTT, silica or CaF2",
+    )
     static_rms_nm: float = Field(
         default=0.0, ge=0, description="rms of a known static Kolmogorov aberration in the arm of the sensor"
     )
@@ -58,8 +69,10 @@ class CurvatureSensorSettings(BaseModel):
         return self
 
     @model_serializer(mode="wrap")
-    def _without_waves_that_are_not_set(
+    def _without_keys_that_do_nothing(
         self, write: Callable[["CurvatureSensorSettings"], dict[str, Any]]
     ) -> dict[str, Any]:
-        """Keep the fingerprint of settings as it was before there was this key."""
-        return {name: value for name, value in write(self).items() if name != "defocus_waves" or value is not None}
+        """Keep the fingerprint of settings as it was before there were these keys."""
+        unused = {"defocus_waves": self.defocus_waves is None, "lenses": self.lenses == "achromatic"}
+        unused["glasses"] = self.lenses != "doublet"
+        return {name: value for name, value in write(self).items() if not unused.get(name, False)}

@@ -203,27 +203,27 @@ def conjugate_gradients(
     return jax.lax.scan(one, carry, None, length=count)[0][0]
 
 
-def ffts_per_step(planes: int, inner: int) -> int:
+def ffts_per_step(planes: int, inner: int, *, colours: int = 1) -> int:
     """Two-dimensional complex FFTs of one step without its tries; two real ones count as one.
 
     Light there, gradient back, and for each conjugate gradient both; the phase of an unknown is half an FFT.
 
     Examples:
-        >>> ffts_per_step(4, 5)
-        66
+        >>> ffts_per_step(4, 5), ffts_per_step(4, 5, colours=3)
+        (66, 186)
     """
-    through = planes + 1
+    through = colours * (planes + 1)
     return 2 * through + 1 + inner * (2 * through + 1)
 
 
-def ffts_per_try(planes: int) -> int:
+def ffts_per_try(planes: int, *, colours: int = 1) -> int:
     """FFTs of one evaluation of the cost, rounded up.
 
     Examples:
-        >>> ffts_per_try(4)
-        6
+        >>> ffts_per_try(4), ffts_per_try(4, colours=3)
+        (6, 16)
     """
-    return planes + 2
+    return colours * (planes + 1) + 1
 
 
 def plus(a: Unknown, b: Unknown, factor: float | Float[Array, ""]) -> Unknown:

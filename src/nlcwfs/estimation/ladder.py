@@ -1,5 +1,6 @@
 """The resolutions that a reconstruction climbs: binned images first, then ever finer waves, then everything."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -63,10 +64,11 @@ def build_ladder(
 def finest_level(
     geometry: SensorGeometry, turbulence: Turbulence, *, oversampling: int, window: float, dtype: str
 ) -> Level:
-    """The full resolution alone, in a window of at least so many telescopes."""
+    """The full resolution alone, in a window of at least so many telescopes, and in all colours of the model."""
     shape = window_shape(geometry, 1, window)
     settings = GerchbergSaxtonSettings(oversampling=oversampling)
-    return _level(geometry, settings, turbulence, Grid(shape, geometry.frame.pixel_m), 1, (), dtype=dtype)
+    level = _level(geometry, settings, turbulence, Grid(shape, geometry.frame.pixel_m), 1, (), dtype=dtype)
+    return dataclasses.replace(level, colours=geometry.in_colour(level.grid, dtype=dtype))
 
 
 def _check_cutoffs(cutoffs_cpa: tuple[float, ...]) -> None:

@@ -35,6 +35,13 @@ class MapSettings(BaseModel):
         ),
         description="the same on a pupil made of segments: on the field, whose steps no filter may smooth",
     )
+    wavelengths: int = Field(
+        default=1,
+        ge=1,
+        le=32,
+        description="Wavelengths by which the model stands for light of a band; 1 takes all light for that of the "
+        "wavelength of sensing, as in the paper. Each costs as much as the first.",
+    )
     oversampling: int = Field(
         default=2, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
     )
@@ -74,7 +81,10 @@ class MapSettings(BaseModel):
         "smaller islands where the turbulence is very strong, for more healings",
     )
     ffts_per_frame: int = Field(
-        default=100, ge=1, le=1000000, description="FFTs for each frame of a sequence after the first; fixed"
+        default=100,
+        ge=1,
+        le=1000000,
+        description="FFTs for each frame of a sequence after the first, of each wavelength of the model; fixed",
     )
     sequence_steps: int = Field(
         default=3, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"

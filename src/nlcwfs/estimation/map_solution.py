@@ -124,7 +124,9 @@ def solved(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[Ar
     )
     model = problem.expected(problem.known_rad + problem.prior.phase_rad(state.unknown))
     planes = problem.counts.shape[0]
-    spent = state.iteration * gn.ffts_per_step(planes, inner) + (state.tries + 1) * gn.ffts_per_try(planes)
+    colours = task.level.colour_count
+    each, tried = gn.ffts_per_step(planes, inner, colours=colours), gn.ffts_per_try(planes, colours=colours)
+    spent = state.iteration * each + (state.tries + 1) * tried
     return Solution(
         unknown=state.unknown,
         model=model,

@@ -75,6 +75,7 @@ class Level(eqx.Module):
         gain: Length of a step.
         fast_forward: Share of the last step that is added ahead of the next one.
         tolerance_rad: An iteration that moves less ends the level.
+        colours: The sensor in all colours of a model of many; None where `optics`, of one colour, is the model.
     """
 
     optics: CurvatureSensor
@@ -93,11 +94,17 @@ class Level(eqx.Module):
     fast_forward: float = eqx.field(static=True)
     doubt: float = eqx.field(static=True)
     tolerance_rad: float = eqx.field(static=True)
+    colours: CurvatureSensor | None = None
 
     @property
     def measured_shape(self) -> tuple[int, int]:
         """Measured pixels along y and x, the unmeasured rim included."""
         return self.grid.shape[0] // self.oversampling, self.grid.shape[1] // self.oversampling
+
+    @property
+    def colour_count(self) -> int:
+        """Wavelengths of the model."""
+        return 1 if self.colours is None else len(self.colours.spectrum.wavelengths_m)
 
     def on_pixels(self, photons: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
         """What the measured pixels see of light on the model's grid."""

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.spectrum import Spectrum
+from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 
 
@@ -24,6 +25,9 @@ class SensorGeometry:
         flux_fractions: Share of the light of each plane; equal when left out.
         static_opd_m: Known aberration in the arm of the sensor, on the frame's pixels ...
         static_grid: ... or on these, which may be finer.
+        spectrum: Wavelengths that stand for a band of light in a model of many colours; None where one is enough.
+        colour_distances_m: Where each plane is in each of them; at `distances_m` in all when left out.
+        star: Where each of them comes from, and how large the star is.
     """
 
     pupil: PupilShape
@@ -33,6 +37,9 @@ class SensorGeometry:
     flux_fractions: tuple[float, ...] | None = None
     static_opd_m: Float[np.ndarray, "y x"] | None = field(default=None, compare=False)
     static_grid: Grid | None = None
+    spectrum: Spectrum | None = None
+    colour_distances_m: tuple[tuple[float, ...], ...] | None = None
+    star: ApparentStar = POINT
 
     def model(self, grid: Grid, *, dtype: str) -> CurvatureSensor:
         """The sensor's optics on a grid of the reconstructor."""
@@ -45,6 +52,19 @@ class SensorGeometry:
             spectrum=Spectrum.monochromatic(self.wavelength_m),
             flux_fractions=self.flux_fractions,
             static_opd_m=static,
+            dtype=dtype,
+        )
+
+    def in_colour(self, grid: Grid, *, dtype: str) -> CurvatureSensor | None:
+        """The optics in all colours of the model, without the static aberration; None where one colour is enough."""
+        if self.spectrum is None:
+            return None
+        return CurvatureSensor.build(
+            self.pupil.on(grid),
+            grid,
+            distances_m=np.array(self.colour_distances_m) if self.colour_distances_m else self.distances_m,
+            spectrum=self.spectrum,
+            star=self.star,
             dtype=dtype,
         )
 

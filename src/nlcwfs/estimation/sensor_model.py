@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nlcwfs.estimation.gerchberg_saxton import pupil_light
@@ -22,7 +23,14 @@ class PlaneScale(NamedTuple):
 
 
 def light_on_pixels(level: Level, phase_rad: Float[Array, "y x"]) -> Float[Array, "plane v u"]:
-    """Light of unit power at the pupil, on the measured pixels of every plane; `planes + 1` FFTs."""
+    """Light of unit power at the pupil, on the measured pixels of every plane; `planes + 1` FFTs for each colour.
+
+    The phase is that of the wavelength at which the sensor works; other colours see the same path.
+    """
+    colours, planes = level.colours, level.optics.transfer.shape[1]
+    if colours is not None:
+        opd_m = phase_rad * (level.optics.spectrum.wavelengths_m[0] / (2 * np.pi))
+        return level.on_pixels(planes * colours.images(opd_m, 1.0).photons)
     near = pupil_light(level, phase_rad)
     far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * level.optics.transfer[0])
     return level.on_pixels(far.real**2 + far.imag**2)

@@ -6,7 +6,7 @@ from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.gauss_newton import ffts_per_step
 
 
-def fixed_ffts(planes: int, *, inner: tuple[int, ...], oversampling: int = 2) -> int:
+def fixed_ffts(planes: int, *, inner: tuple[int, ...], oversampling: int = 2, colours: int = 1) -> int:
     """FFTs of a frame that is followed: steps, the prediction, the model at the end and the filters of the verdict.
 
     The verdict filters counts and residual on the frames' pixels, whose FFTs are smaller than the model's.
@@ -15,13 +15,17 @@ def fixed_ffts(planes: int, *, inner: tuple[int, ...], oversampling: int = 2) ->
         planes: Of the sensor.
         inner: Conjugate gradients of each step.
         oversampling: Cells of the model per pixel along an axis.
+        colours: Wavelengths of the model.
 
     Examples:
         >>> fixed_ffts(4, inner=(2, 2, 1)), fixed_ffts(4, inner=(3, 3), oversampling=1)
         (97, 103)
+        >>> fixed_ffts(4, inner=(2, 2, 1), colours=3)
+        267
     """
     verdict = math.ceil(2 * planes / oversampling**2)
-    return sum(ffts_per_step(planes, each) for each in inner) + planes + 3 + verdict
+    steps = sum(ffts_per_step(planes, each, colours=colours) for each in inner)
+    return steps + colours * (planes + 1) + 2 + verdict
 
 
 def inner_steps(planes: int, *, budget: int, steps: int, oversampling: int = 2) -> tuple[int, ...]:

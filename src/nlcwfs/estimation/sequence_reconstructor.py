@@ -10,13 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.fit_quality import unexplained_share
-from nlcwfs.estimation.frame_prediction import (
-    lasting_correlation,
-    posterior_power,
-    predicted_mean_and_power,
-    unseen_share,
-    wind_carriage,
-)
+from nlcwfs.estimation.followed_air import FollowedAir
 from nlcwfs.estimation.map_solution import Found, Task
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
@@ -30,14 +24,9 @@ from nlcwfs.estimation.sequence_memory import Memory, plane_counts
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
 from nlcwfs.estimation.turbulence_filter import half_plane_frequencies, rms_of_power
-from nlcwfs.estimation.wave_sensitivity import LAGS, roughness, seen_share
+from nlcwfs.estimation.wave_sensitivity import roughness, seen_share
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown
-
-TRUST = 0.8
-"""Share of the prediction in what is expected; the rest is air that has never been seen. Air comes in over the rim of
-the pupil, which a filter that is diagonal in Fourier space cannot know: without it a loop that knows its wind ends at
-143 nm, with nine tenths at 72 (`bench/closed_loop.py`)."""
 
 TILT_CYCLES = 1.0
 """A tilt is seen as well as a wave of so many cycles per aperture: the rim of the pupil moves."""
@@ -52,8 +41,7 @@ class SequenceReconstructor(eqx.Module):
 
     Attributes:
         solver: Reconstructs single frames.
-        correlation: How much of each wave a frame shows again.
-        tilt_correlation: The same for the tilt.
+        air: How the phase goes on.
         inner: Conjugate gradients of each step.
 
     Examples:
@@ -66,8 +54,7 @@ class SequenceReconstructor(eqx.Module):
     """
 
     solver: MaximumAPosteriori
-    correlation: Array
-    tilt_correlation: float = eqx.field(static=True)
+    air: FollowedAir
     inner: tuple[int, ...] = eqx.field(static=True)
     interval_s: float = eqx.field(static=True)
 
@@ -107,32 +94,25 @@ class SequenceReconstructor(eqx.Module):
             oversampling=options.oversampling,
         )
         solver = MaximumAPosteriori.build(geometry, settings, dtype=dtype)
-        grid, speed, diameter_m = solver.level.grid, prior.wind_speed_m_per_s, geometry.pupil.diameter_m
-        if prior.wind_direction_deg is None:
-            information = 4 * photons / (SENSOR_LOSS * float(jnp.sum(solver.level.light)))
-            power = np.asarray(solver.power, float)
-            again = lasting_correlation(grid, power, information=information, wind_m_per_s=speed, interval_s=interval_s)
-        else:
-            angle = np.deg2rad(prior.wind_direction_deg)
-            layers = [(1.0, speed * np.sin(angle), speed * np.cos(angle))]
-            again = wind_carriage(grid, layers, interval_s=interval_s)
-        new = unseen_share(diameter_m=diameter_m, wind_m_per_s=speed, interval_s=interval_s)
-        moved = np.pi * speed * interval_s / diameter_m
-        again = np.asarray(again) * np.sqrt(1 - new)
-        kind = np.result_type(dtype, np.complex64) if np.iscomplexobj(again) else dtype
-        return cls(
-            solver=solver,
-            correlation=jnp.asarray(again, kind),
-            tilt_correlation=float(np.exp(-(moved**2) / 2)),
-            inner=inner,
+        information = 4 * photons / (SENSOR_LOSS * float(jnp.sum(solver.level.light)))
+        air = FollowedAir.build(
+            solver.level.grid,
+            solver.power,
+            solver.tilt_rms_rad,
+            prior,
+            diameter_m=geometry.pupil.diameter_m,
+            wavelength_m=geometry.wavelength_m,
             interval_s=interval_s,
+            information=information,
         )
+        return cls(solver=solver, air=air, inner=inner, interval_s=interval_s)
 
     @property
     def ffts(self) -> int:
         """FFTs of every frame after the first."""
-        planes = self.solver.level.optics.transfer.shape[1]
-        return fixed_ffts(planes, inner=self.inner, oversampling=self.solver.settings.map.oversampling)
+        level = self.solver.level
+        planes, colours = level.optics.transfer.shape[1], level.colour_count
+        return fixed_ffts(planes, inner=self.inner, oversampling=level.oversampling, colours=colours)
 
     def start(
         self,
@@ -160,10 +140,8 @@ class SequenceReconstructor(eqx.Module):
         solver, task, strength = self.solver, found.task, found.strength
         total = plane_counts(task.measured)
         scale = PlaneScale(task.scale.counts / total, task.scale.background)
-        rms_rad = solver.tilt_rms_rad * jnp.sqrt(strength)
-        flat = jnp.zeros_like(task.problem.known_rad)
-        parts = self._remembered(task, found.search.best.unknown, found.slope, flat, rms_rad)
-        return Memory(*parts, strength, scale, jnp.zeros(len(LAGS), strength.dtype))
+        unseen = self.air.unseen(strength, found.slope, scale)
+        return self.air.seen(unseen, task.problem, found.search.best.unknown, jnp.sum(solver.level.light))
 
     def phase_of(self, opd_m: Float[Array, "y x"]) -> Float[Array, "y x"]:
         """Phase of a wavefront at the wavelength of sensing."""
@@ -197,7 +175,7 @@ class SequenceReconstructor(eqx.Module):
         known_rad = solver.known_rad(memory.slope) + expected.phase_rad
         if known_m is not None:
             known_rad = known_rad + self.phase_of(known_m)
-        prior = solver.prior(expected.left_open, expected.tilt_left_rad)
+        prior = self.air.prior(expected)
         total = plane_counts(measured)
         scale = PlaneScale(memory.scale.counts * total, memory.scale.background)
         task = solver.task(measured, known_rad, scale, prior, memory.strength)
@@ -207,21 +185,13 @@ class SequenceReconstructor(eqx.Module):
         for inner in self.inner:
             direction, _ = gn.direction_of_step(task.problem, inner, unknown)
             unknown = gn.plus(unknown, direction, 1.0)
-        parts = self._remembered(task, unknown, memory.slope, expected.phase_rad, expected.tilt_left_rad)
-        estimate = self._account(task, unknown, parts, memory.strength)
-        surprise_rad2 = roughness(parts[0] - expected.phase_rad, level)
-        return estimate, Memory(*parts, memory.strength, memory.scale, surprise_rad2)
+        after = self.air.seen(expected, task.problem, unknown, jnp.sum(level.light))
+        surprise_rad2 = roughness(after.phase_rad - expected.phase_rad, level)
+        return self._account(task, unknown, after), dataclasses.replace(after, surprise_rad2=surprise_rad2)
 
     def skip(self, memory: Memory) -> Memory:
         """What is expected one interval later; call it for every frame that is missing."""
-        solver = self.solver
-        power = solver.power * memory.strength
-        mean_rad, left_open = predicted_mean_and_power(memory.phase_rad, memory.left_open, power, self.correlation)
-        left_open = TRUST * left_open + (1 - TRUST) * power
-        again = self.tilt_correlation**2
-        tilt = solver.tilt_rms_rad**2 * memory.strength
-        tilt_left_rad = jnp.sqrt(again * memory.tilt_left_rad**2 + (1 - again) * tilt)
-        return dataclasses.replace(memory, phase_rad=mean_rad, left_open=left_open, tilt_left_rad=tilt_left_rad)
+        return self.air.expected(memory)
 
     def _shown(self, rough_rad2: Float[Array, " lag"]) -> Unknown:
         """Share of the information that waves and tilt get from a wavefront of this roughness."""
@@ -236,20 +206,7 @@ class SequenceReconstructor(eqx.Module):
         tilt = seen_share(np.full(2, TILT_CYCLES / geometry.pupil.diameter_m), rough_rad2, **sensor)
         return Unknown(waves, tilt)
 
-    def _remembered(
-        self, task: Task, unknown: Unknown, slope: Float[Array, "2"], mean_rad: Float[Array, "y x"], rms_rad: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Phase, slope and what is left open of both."""
-        problem, prior, level = task.problem, task.prior, self.solver.level
-        phase_rad = mean_rad + prior.phase_rad(Unknown(unknown.waves, jnp.zeros_like(unknown.slope)))
-        diameter_m, wavelength_m = self.solver.geometry.pupil.diameter_m, self.solver.geometry.wavelength_m
-        # A tilt of unit rms over a disc is 2 r / R (Noll).
-        slope = slope + unknown.slope * rms_rad * (4 / diameter_m * wavelength_m / (2 * np.pi))
-        left_open = posterior_power(prior.amplitude**2, problem.information * problem.shown.waves)
-        seen = problem.information * problem.shown.slope[0] * jnp.sum(level.light)
-        return phase_rad, slope, left_open, jnp.sqrt(rms_rad**2 / (1 + rms_rad**2 * seen))
-
-    def _account(self, task: Task, unknown: Unknown, parts: tuple, strength: Float[Array, ""]) -> WavefrontEstimate:
+    def _account(self, task: Task, unknown: Unknown, after: Memory) -> WavefrontEstimate:
         """Wavefront, expected error and verdict of a frame that was followed."""
         solver, problem = self.solver, task.problem
         geometry = solver.geometry
@@ -264,7 +221,7 @@ class SequenceReconstructor(eqx.Module):
         dark = jnp.any(jnp.sum(jnp.where(task.measured.usable, problem.counts, 0), axis=(1, 2)) <= 0)
         code = jnp.where(dark, Outcome.NO_LIGHT, code)
         code = jnp.where(jnp.all(jnp.isfinite(opd_m)), code, Outcome.NOT_FINITE).astype(jnp.int32)
-        left = rms_of_power(parts[2], solver.level.grid) ** 2 + 2 * parts[3] ** 2 + task.beyond
+        left = rms_of_power(after.left_open, solver.level.grid) ** 2 + 2 * after.tilt_left_rad**2 + task.beyond
         residual = jnp.where(task.measured.usable, problem.counts - model, 0)
         return WavefrontEstimate(
             opd_m=opd_m,
@@ -274,5 +231,5 @@ class SequenceReconstructor(eqx.Module):
             iterations=jnp.asarray(solver.settings.map.sequence_steps, jnp.int32),
             ffts=jnp.asarray(self.ffts, jnp.int32),
             outcome_code=code,
-            strength=strength,
+            strength=after.strength,
         )

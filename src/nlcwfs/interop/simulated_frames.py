@@ -13,6 +13,7 @@ from nlcwfs.config import Config
 from nlcwfs.detector.read import Detector
 from nlcwfs.interop.frames_file import FramesFile
 from nlcwfs.interop.pupil_fits import read_pupil_shape
+from nlcwfs.simulation.colours import bandwidth_m
 from nlcwfs.simulation.exposure import (
     Exposure,
     ExposureSimulator,
@@ -97,6 +98,8 @@ def frames_of(
         diameter_m=config.beam.diameter_m,
         distances_m=distances_m(config),
         obstruction_ratio=simulator.shape.obstruction_ratio,
+        bandwidth_m=bandwidth_m(config),
+        chromatic_lenses=config.curvature_sensor.lenses != "achromatic",
         gain_electrons_per_adu=camera.gain_electrons_per_adu / camera.em_gain,
         read_noise_electrons=math.sqrt(float(detector.variance_electrons(jnp.zeros(())))),
         dark_electrons=camera.dark_electrons,

@@ -6,7 +6,6 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import scipy.fft
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -14,14 +13,14 @@ from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
-from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
-from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor, centred_in
+from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
-from nlcwfs.errors import SamplingError
+from nlcwfs.simulation.colours import colours_of
 from nlcwfs.simulation.segment_aberrations import SegmentAberrations
+from nlcwfs.simulation.static_aberration import lit_part, static_aberration
 from nlcwfs.simulation.telescope import telescope
 
 SMALLEST_LIGHT = 1e-6
@@ -63,6 +62,7 @@ class ExposureSimulator(eqx.Module):
         sensor: The optics on the grid of the light.
         weights: Share of the light in every cell of the pupil, on the grid of the light.
         detector: The camera.
+        wavelength_m: Wavelength of sensing, at which the reconstructor works.
         photons: Photons that the whole sensor gets in one exposure.
         factor: Cells of the light along a detector pixel.
         window: Detector pixels along y and x.
@@ -84,6 +84,7 @@ class ExposureSimulator(eqx.Module):
     sensor: CurvatureSensor
     weights: Float[Array, "y x"]
     detector: Detector
+    wavelength_m: float = eqx.field(static=True)
     photons: float = eqx.field(static=True)
     factor: int = eqx.field(static=True)
     window: tuple[int, int] = eqx.field(static=True)
@@ -105,9 +106,10 @@ class ExposureSimulator(eqx.Module):
         shape, air = telescope(config) if shape is None else shape, turbulence(config)
         light = light_grid(config)
         pupil = shape.on(light)
-        cut = _lit_part(pupil)
+        cut = lit_part(pupil)
         window = (config.detector.window_pixels, config.detector.window_pixels)
         weights = light_weights(pupil)
+        colours = colours_of(config, air)
         return cls(
             shape=shape,
             light=light,
@@ -116,14 +118,16 @@ class ExposureSimulator(eqx.Module):
             sensor=CurvatureSensor.build(
                 pupil,
                 light,
-                distances_m=distances_m(config),
-                spectrum=Spectrum.monochromatic(wavelength_m(config)),
+                distances_m=colours.distances_m,
+                spectrum=colours.spectrum,
                 flux_fractions=config.curvature_sensor.flux_fractions,
                 static_opd_m=static_aberration(config, weights, light),
+                star=colours.star,
                 dtype=dtype,
             ),
             weights=jnp.asarray(weights, dtype),
             detector=Detector(config.detector),
+            wavelength_m=wavelength_m(config),
             photons=config.atmosphere.photons,
             factor=config.simulation.light_oversampling,
             window=window,
@@ -258,33 +262,3 @@ def light_grid(config: Config) -> Grid:
         size += 1  # odd around odd, even around even: the centres agree
     pixel_m = config.beam.diameter_m / (detector.pixels_across_pupil * simulation.light_oversampling)
     return Grid((size, size), pixel_m)
-
-
-def static_aberration(config: Config, weights: Float[np.ndarray, "Y X"], grid: Grid) -> Float[np.ndarray, "Y X"]:
-    """The known aberration in the arm of the sensor: Kolmogorov without piston and tilt, of exactly its rms.
-
-    Tilt is left out because it moves all images alike in angle: alignment takes it away.
-    """
-    rms_m = config.curvature_sensor.static_rms_nm * 1e-9
-    if rms_m == 0:
-        return np.zeros(grid.shape)
-    cut = _lit_part(weights)
-    screens = PhaseScreens.build(Turbulence(1.0), shape=weights[cut].shape, pixel_m=grid.pixel_m)
-    drawn = np.asarray(screens.draw(jax.random.key(config.curvature_sensor.static_seed)), float)
-    planes = np.stack([axis[cut] for axis in np.broadcast_arrays(1.0, grid.y_m, grid.x_m)])
-    weighted = planes * weights[cut]
-    slopes = np.linalg.solve(np.einsum("ayx,byx->ab", weighted, planes), np.einsum("ayx,yx->a", weighted, drawn))
-    bent = np.where(weights[cut] > 0, drawn - np.einsum("a,ayx->yx", slopes, planes), 0)
-    return centred_in(bent * (rms_m / math.sqrt(np.sum(weights[cut] * bent**2))), grid.shape)
-
-
-def _lit_part(pupil: Float[np.ndarray, "Y X"]) -> tuple[slice, slice]:
-    """The smallest part of a grid that holds all the light, of which there must be some, and has its centre."""
-    slices = []
-    for size, lit in zip(pupil.shape, (pupil.any(axis=1), pupil.any(axis=0)), strict=True):
-        index = np.flatnonzero(lit)
-        if not index.size:
-            raise SamplingError("beam.pupil_map", "must let light through on the grid of the light", "no light")
-        margin = int(min(index[0], size - 1 - index[-1]))
-        slices.append(slice(margin, size - margin))
-    return slices[0], slices[1]

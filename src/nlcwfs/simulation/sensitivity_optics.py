@@ -17,9 +17,11 @@ from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.speckle_blur import blurred
-from nlcwfs.simulation.exposure import distances_m, static_aberration, wavelength_m
+from nlcwfs.simulation.colours import refuse_colours
+from nlcwfs.simulation.exposure import distances_m, wavelength_m
 from nlcwfs.simulation.sensitivity import Optics
 from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
+from nlcwfs.simulation.static_aberration import static_aberration
 from nlcwfs.simulation.telescope import telescope
 
 
@@ -35,6 +37,7 @@ def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuesti
     Raises:
         SettingsError: If settings contradict each other.
         SamplingError: If the grid is too coarse.
+        SettingsError: If the settings ask for light of many colours.
 
     Examples:
         >>> case = SensitivityCase(name="linear curvature", set=("curvature_sensor.distances_km=[-1000, 1000]",))
@@ -44,6 +47,7 @@ def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuesti
         >>> optics.grid.shape, optics.images(jnp.zeros((64, 64))).shape
         ((64, 64), (2, 64, 64))
     """
+    refuse_colours(config, because="nlcwfs sensitivity")
     cells = question.flat if air is None else question.rough
     if case.sensor == "shack-hartmann":
         return _lenslets(config, air)

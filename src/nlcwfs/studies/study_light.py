@@ -14,9 +14,10 @@ from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
-from nlcwfs.simulation.exposure import ExposureSimulator, _lit_part, frame_key
+from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.segment_score import segment_pixels
+from nlcwfs.simulation.static_aberration import lit_part
 from nlcwfs.studies.study_cases import Case
 
 Progress = Callable[[str, int, int], None]
@@ -62,7 +63,7 @@ class Light(NamedTuple):
 def make_light(case: Case, config: Config, count: int, progress: Progress) -> Light:
     """Expose the detector to `count` skies."""
     simulator = ExposureSimulator.build(config)
-    cut = _lit_part(np.asarray(simulator.weights))
+    cut = lit_part(np.asarray(simulator.weights))
     weights = np.asarray(simulator.weights, float)[cut]
     grid = simulator.light.padded(weights.shape)
     matched = matched_model(config, simulator) if case.light == "matched" else None

@@ -131,7 +131,7 @@ def residual_structure(
         waves: Modes of the loop.
         driven_m2: Variance that is left of the driven ones.
     """
-    wave_m = float(light.still.sensor.spectrum.wavelengths_m[0])
+    wave_m = light.still.wavelength_m
     cycles_per_m = waves.cycles[: waves.driven] / light.still.shape.diameter_m
     apart = 1 - scipy.special.j0(2 * np.pi * cycles_per_m * separation_m[:, None])
     driven = 2 * apart @ driven_m2 * (2 * np.pi / wave_m) ** 2

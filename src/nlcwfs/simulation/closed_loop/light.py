@@ -16,6 +16,7 @@ from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
+from nlcwfs.simulation.colours import refuse_colours
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
@@ -75,6 +76,8 @@ class LoopLight(eqx.Module):
         mirror = Mirror.build(config.mirror, pupil, part, diameter_m=diameter_m, dtype=dtype)
         weights = _middle(np.asarray(still.weights, float), cut)
         optics = CurvatureOptics(still)
+        if config.loop.sensor in ("shack-hartmann", "pyramid"):
+            refuse_colours(config, because=f'loop.sensor = "{config.loop.sensor}"')
         if config.loop.sensor == "shack-hartmann":
             optics = LensletOptics.build(config, still, weights > 0)
         if config.loop.sensor == "pyramid":
@@ -180,7 +183,8 @@ def with_planes_of_sensor(config: Config) -> Config:
     """
     if config.loop.sensor != "linear-curvature":
         return config
-    planes = CurvatureSensorSettings(distances_km=config.linear_curvature.distances_km)
+    lenses = {"lenses": config.curvature_sensor.lenses, "glasses": config.curvature_sensor.glasses}
+    planes = CurvatureSensorSettings(distances_km=config.linear_curvature.distances_km, **lenses)
     return config.model_copy(update={"curvature_sensor": planes})
 
 

@@ -4,23 +4,21 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
-from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
 from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
-from nlcwfs.estimation.resolution_level import sum_blocks
 from nlcwfs.estimation.second_look import SecondLook
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
+from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.simulation.closed_loop.light import LoopLight
+from nlcwfs.simulation.closed_loop.model_cells import ModelCells
 from nlcwfs.simulation.closed_loop.sight import Cautious, PixelModes, Sight
 from nlcwfs.simulation.exposure import Exposure
 from nlcwfs.simulation.known_sensor import geometry_of
@@ -67,12 +65,9 @@ class FollowedCurvature(eqx.Module):
     second: SecondLook
     pixels: PixelModes
     cautious: Cautious
-    corner: tuple[int, int] = eqx.field(static=True)
-    nearest: tuple[np.ndarray, np.ndarray]
-    coarser: int = eqx.field(static=True)
+    on_model: ModelCells
     read_variance: float = eqx.field(static=True)
     look_again_every: int = eqx.field(static=True)
-    weights: Float[Array, "Y X"]
 
     @classmethod
     def build(cls, config: Config, light: LoopLight) -> "FollowedCurvature":
@@ -82,11 +77,7 @@ class FollowedCurvature(eqx.Module):
             SettingsError: If settings contradict each other.
         """
         still, geometry = light.still, geometry_of(config, light.still)
-        settings = config.estimation
-        if settings.prior.wind_speed_m_per_s == type(settings.prior)().wind_speed_m_per_s:
-            speed = max(config.atmosphere.wind_speeds_m_per_s)
-            prior = settings.prior.model_copy(update={"wind_speed_m_per_s": speed})
-            settings = settings.model_copy(update={"prior": prior})
+        settings = with_wind_of_air(config)
         own = settings.map
         patient = {
             "healings": max(own.healings, PATIENT["healings"]),
@@ -97,33 +88,15 @@ class FollowedCurvature(eqx.Module):
         rate_hz = light.sequence.rate_hz
         sequence = SequenceReconstructor.build(geometry, settings, interval_s=1 / rate_hz, photons=still.photons)
         level = sequence.solver.level
-        coarser, rest = divmod(still.factor, level.oversampling)
-        if rest:
-            rule = f"must be a multiple of estimation.map.oversampling ({level.oversampling}) in a loop"
-            raise SettingsError("simulation.light_oversampling", rule, still.factor)
-        lit = np.asarray(level.light) > 0
-        nearest = np.asarray(scipy.ndimage.distance_transform_edt(~lit, return_distances=False, return_indices=True))
-        corner = [(a * coarser - b) // 2 for a, b in zip(level.grid.shape, light.weights.shape, strict=True)]
         return cls(
             reconstructor=sequence,
             second=SecondLook.build(sequence),
             pixels=PixelModes.build(light),
             cautious=Cautious.build(config, np.asarray(light.mirror.cycles_per_aperture)),
-            corner=(corner[0], corner[1]),
-            nearest=(nearest[0], nearest[1]),
-            coarser=coarser,
+            on_model=ModelCells.build(light, np.asarray(level.light) > 0, oversampling=level.oversampling),
             read_variance=still.detector.variance_without_light,
             look_again_every=config.loop.look_again_every,
-            weights=light.weights,
         )
-
-    def on_model(self, mirror_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "y x"]:
-        """A shape of the mirror on the model's grid, continued beyond the rim as it is there."""
-        margins = [(corner, corner) for corner in self.corner]
-        both = jnp.stack([jnp.pad(self.weights * mirror_m, margins), jnp.pad(self.weights, margins)])
-        summed = sum_blocks(both, self.coarser)
-        mean_m = jnp.where(summed[1] > 0, summed[0] / jnp.where(summed[1] > 0, summed[1], 1), 0)
-        return mean_m[self.nearest[0], self.nearest[1]]
 
     @eqx.filter_jit
     def _looked(
@@ -195,6 +168,21 @@ class FollowedCurvature(eqx.Module):
     ) -> Sight:
         part_m = self.cautious.part(residual_m, outcome)
         return Sight(part_m, outcome, float(estimate.predicted_error_m), ffts, closed)
+
+
+def with_wind_of_air(config: Config) -> EstimationSettings:
+    """The settings of the estimation, with the speed of the wind where the user has not told another.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> with_wind_of_air(load_config(None, ["atmosphere.wind_speeds_m_per_s=[7]"])).prior.wind_speed_m_per_s
+        7.0
+    """
+    settings = config.estimation
+    if settings.prior.wind_speed_m_per_s != type(settings.prior)().wind_speed_m_per_s:
+        return settings
+    prior = settings.prior.model_copy(update={"wind_speed_m_per_s": max(config.atmosphere.wind_speeds_m_per_s)})
+    return settings.model_copy(update={"prior": prior})
 
 
 class SingleFrames(eqx.Module):

@@ -62,7 +62,7 @@ class Residuals:
     def closed_m2(self) -> Float[np.ndarray, " driven"]:
         """Variance of the driven modes that a closed loop leaves, about."""
         still = self.light.still
-        radian_m = float(still.sensor.spectrum.wavelengths_m[0]) / (2 * math.pi)
+        radian_m = still.wavelength_m / (2 * math.pi)
         noise_m2 = NOISE_SHARE * radian_m**2 / (4 * still.photons)
         return np.minimum(self.drive.open_m2[: self.drive.driven], self.drive.moved_m2 + noise_m2)
 

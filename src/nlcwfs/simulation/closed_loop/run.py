@@ -202,7 +202,7 @@ def loop_bounds(light: LoopLight) -> dict[str, float]:
 
 def still_wavelength_m(light: LoopLight) -> float:
     """Wavelength of sensing."""
-    return float(light.still.sensor.spectrum.wavelengths_m[0])
+    return light.still.wavelength_m
 
 
 def _learns_at(loop: Loop, state: LoopState) -> int:

@@ -14,6 +14,7 @@ from nlcwfs.simulation.closed_loop.linear_images import handed_over
 from nlcwfs.simulation.closed_loop.measurement import FollowedCurvature, IdealMeasurement, SingleFrames
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
 from nlcwfs.simulation.closed_loop.pyramid_sensor import FollowedPyramid
+from nlcwfs.simulation.closed_loop.pyramid_solved import SearchingPyramid
 from nlcwfs.simulation.closed_loop.sight import Sight
 from nlcwfs.simulation.exposure import Exposure
 
@@ -70,6 +71,8 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
     if isinstance(light.optics, LensletOptics):
         return FollowedSpots.build(config, light, light.optics)
     if isinstance(light.optics, PyramidOptics):
+        if config.pyramid.reconstructor == "map":
+            return SearchingPyramid.build(config, light, light.optics)
         return FollowedPyramid.build(config, light, light.optics)
     if config.loop.sensor == "ideal":
         return IdealMeasurement(light)

@@ -8,6 +8,7 @@ from nlcwfs.beam.sampling import SamplingNeed
 from nlcwfs.config import Config
 from nlcwfs.detector.read import Detector
 from nlcwfs.errors import SettingsError
+from nlcwfs.simulation.colours import refuse_colours
 from nlcwfs.simulation.design.blind_frequencies import blind_frequencies
 from nlcwfs.simulation.design.loop_errors import LoopErrors, Planes, best_rate_hz, loop_errors
 from nlcwfs.simulation.design.loop_residual import Loop, LoopResidual
@@ -75,6 +76,7 @@ def design(config: Config, shape: PupilShape, wishes: Wishes, tell: Tell = lambd
     Raises:
         SettingsError: If a requirement cannot be met; the message says by how much.
     """
+    refuse_colours(config, because="nlcwfs design")
     photons_per_s = starlight_per_s(config)
     if photons_per_s is None:
         rule = "must be given, or atmosphere.photons_per_s: a design needs a star"
