@@ -5,12 +5,19 @@ from jaxtyping import Float
 
 from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.config import Config
+from nlcwfs.curvature_sensor.apparent_star import POINT
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.simulation.colours import colours_of
 from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, wavelength_m
 
 
 def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
-    """What the reconstructor knows of the sensor, a static aberration included."""
+    """What the reconstructor knows of the sensor: a static aberration, and the colours if its model has several."""
+    count, colours = config.estimation.map.wavelengths, None
+    if count > 1 and config.beam.spectrum.shape != "line":
+        spectrum = config.beam.spectrum.model_copy(update={"wavelengths": count})
+        beam = config.beam.model_copy(update={"spectrum": spectrum})
+        colours = colours_of(config.model_copy(update={"beam": beam}), simulator.air)
     return SensorGeometry(
         pupil=simulator.shape,
         frame=simulator.frame,
@@ -19,6 +26,9 @@ def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
         flux_fractions=config.curvature_sensor.flux_fractions,
         static_opd_m=_static_m(simulator) if config.curvature_sensor.static_rms_nm else None,
         static_grid=simulator.light,
+        spectrum=colours and colours.spectrum,
+        colour_distances_m=colours and tuple(tuple(map(float, one)) for one in colours.distances_m),
+        star=colours.star if colours else POINT,
     )
 
 

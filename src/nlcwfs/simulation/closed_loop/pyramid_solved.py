@@ -32,8 +32,9 @@ from nlcwfs.simulation.closed_loop.model_cells import ModelCells
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics, pyramid_on
 from nlcwfs.simulation.closed_loop.pyramid_sensor import FollowedPyramid, PyramidState
 from nlcwfs.simulation.closed_loop.sight import PixelModes, Sight
-from nlcwfs.simulation.exposure import Exposure, lit_part, seeing_arcsec, wavelength_m
+from nlcwfs.simulation.exposure import Exposure, seeing_arcsec, wavelength_m
 from nlcwfs.simulation.known_sensor import geometry_of
+from nlcwfs.simulation.static_aberration import lit_part
 
 EXPLAINED = 1.5
 """Misfit per pixel above which a wavefront is not believed."""
