@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nlcwfs.atmosphere.settings import AtmosphereSettings
+from nlcwfs.beam.segment_layouts import segments_of
 from nlcwfs.beam.settings import BeamSettings
 from nlcwfs.comparison_sensors.settings import LinearCurvatureSettings, PyramidSettings, ShackHartmannSettings
 from nlcwfs.config_messages import ConfigError, problems_in_words, unknown_key
@@ -113,12 +114,13 @@ def cross_checks(config: Config) -> None:
     costs is for `beam.sampling.check_sampling` to say, before light travels.
 
     Raises:
-        SettingsError: If the window of the detector does not hold the pupil.
+        SettingsError: If the window of the detector does not hold the pupil, or segments overlap or leave it.
     """
     window, pupil = config.detector.window_pixels, config.detector.pixels_across_pupil
     if window < pupil:
         rule = f"must be at least detector.pixels_across_pupil ({pupil}) to hold the pupil"
         raise SettingsError("detector.window_pixels", rule, window)
+    segments_of(config.beam)
 
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:

@@ -30,6 +30,8 @@ SELF_EVIDENT = 8  # lines: a function so short is its own example
 WITHOUT_EXAMPLE = {
     "nlcwfs.beam.sampling_cost:window_costs": "its example is that of the estimate it belongs to",
     "nlcwfs.beam.sampling_cost:pixel_error": "the same",
+    "nlcwfs.estimation.first_guess:with_strength": "needs a sensor and its light; `MaximumAPosteriori` shows it",
+    "nlcwfs.estimation.first_guess:segmented_start": "the same",
     "nlcwfs.estimation.gauss_newton:step": "needs a sensor; `MaximumAPosteriori` shows what steps lead to",
     "nlcwfs.estimation.gauss_newton:direction_of_step": "the same",
     "nlcwfs.estimation.flow_filter:modal_information": "needs a sensor and its light",

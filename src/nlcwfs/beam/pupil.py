@@ -1,5 +1,6 @@
 """The shape of the telescope: what fraction of every pixel receives light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.errors import SamplingError, SettingsError
 
 SUBPIXELS = 8
-"""Edge pixels are cut into 8 x 8; with `_covered` inside each, the area of a disc is right to 2e-5."""
+"""Edge pixels are cut into 8 x 8; with `covered` inside each, the area of a disc is right to 2e-5."""
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,14 @@ def circular_pupil(
 
     def lit(y_m: np.ndarray, x_m: np.ndarray, width_m: float) -> np.ndarray:
         radius_m = np.hypot(y_m, x_m)
-        fraction = _covered(radius_m - diameter_m / 2, width_m)
+        fraction = covered(radius_m - diameter_m / 2, width_m)
         if obstruction_ratio > 0:
-            fraction = fraction * (1 - _covered(radius_m - obstruction_ratio * diameter_m / 2, width_m))
+            fraction = fraction * (1 - covered(radius_m - obstruction_ratio * diameter_m / 2, width_m))
         if spiders is not None:
-            fraction = fraction * _beside_vanes(y_m, x_m, width_m, spiders)
+            fraction = fraction * beside_vanes(y_m, x_m, width_m, spiders)
         return fraction
 
-    return pupil_from_map(_antialiased(lit, grid), grid)
+    return pupil_from_map(_on_grid(lit, grid), grid)
 
 
 def pupil_of_discs(
@@ -104,9 +105,9 @@ def pupil_of_discs(
 
     def lit(y_m: np.ndarray, x_m: np.ndarray, width_m: float) -> np.ndarray:
         discs = (np.hypot(y_m - y0, x_m - x0) - disc_diameter_m / 2 for y0, x0 in centres_m)
-        return np.clip(sum(_covered(outside_m, width_m) for outside_m in discs), 0, 1)
+        return np.clip(sum(covered(outside_m, width_m) for outside_m in discs), 0, 1)
 
-    return pupil_from_map(_antialiased(lit, grid), grid)
+    return pupil_from_map(_on_grid(lit, grid), grid)
 
 
 def pupil_from_map(amplitude: np.ndarray, grid: Grid) -> Float[np.ndarray, "y x"]:
@@ -164,12 +165,23 @@ def _check_diameter(diameter_m: float, grid: Grid) -> None:
         raise SamplingError("beam.diameter_m", rule, diameter_m)
 
 
-def _covered(outside_m: np.ndarray, width_m: float) -> np.ndarray:
-    """Fraction of a pixel covered by a region whose straight edge passes `outside_m` before its centre."""
+def covered(outside_m: np.ndarray, width_m: float) -> np.ndarray:
+    """Fraction of a pixel covered by a region whose straight edge passes `outside_m` before its centre.
+
+    Examples:
+        >>> covered(np.array([-1.0, 0.25, 1.0]), 1.0).tolist()
+        [1.0, 0.25, 0.0]
+    """
     return np.clip(0.5 - outside_m / width_m, 0, 1)
 
 
-def _beside_vanes(y_m: np.ndarray, x_m: np.ndarray, width_m: float, spiders: Spiders) -> np.ndarray:
+def beside_vanes(y_m: np.ndarray, x_m: np.ndarray, width_m: float, spiders: Spiders) -> np.ndarray:
+    """Fraction of squares of a width that no vane covers, from their centres.
+
+    Examples:
+        >>> beside_vanes(np.zeros(2), np.array([2.0, -2.0]), 1.0, Spiders((0.0,), width_m=0.25)).tolist()
+        [0.75, 1.0]
+    """
     free = np.ones(np.broadcast_shapes(y_m.shape, x_m.shape))
     for angle_rad in np.deg2rad(spiders.angles_deg):
         along_m = x_m * np.cos(angle_rad) + y_m * np.sin(angle_rad)
@@ -177,23 +189,41 @@ def _beside_vanes(y_m: np.ndarray, x_m: np.ndarray, width_m: float, spiders: Spi
         seen_m = width_m * (abs(np.cos(angle_rad)) + abs(np.sin(angle_rad)))  # a square, seen along the vane
         right_m = np.minimum(across_m + seen_m / 2, spiders.width_m / 2)
         left_m = np.maximum(across_m - seen_m / 2, -spiders.width_m / 2)
-        covered = np.clip((right_m - left_m) / seen_m, 0, 1)  # overlap of vane and pixel, across the vane
-        free = free * (1 - covered * _covered(-along_m, width_m))
+        hidden = np.clip((right_m - left_m) / seen_m, 0, 1)  # overlap of vane and pixel, across the vane
+        free = free * (1 - hidden * covered(-along_m, width_m))
     return free
 
 
-def _antialiased(lit, grid: Grid) -> np.ndarray:
-    """Evaluate `lit(y_m, x_m, width_m)` at the centres, and on 8 x 8 parts of the pixels on an edge."""
-    y_m, x_m = np.broadcast_arrays(grid.y_m, grid.x_m)
+def antialiased(
+    lit: Callable[[np.ndarray, np.ndarray, float], np.ndarray], y_m: np.ndarray, x_m: np.ndarray, pixel_m: float
+) -> Float[np.ndarray, "y x"]:
+    """Share of every pixel that is lit: its centre tells, or its 8 x 8 parts where it is on an edge.
+
+    Args:
+        lit: Share of squares of a width that are lit, from their centres.
+        y_m: Centres of the pixels.
+        x_m: The same along x.
+        pixel_m: Their width.
+
+    Examples:
+        >>> y_m, x_m = np.zeros((1, 2)), np.array([[0.0, 1.0]])
+        >>> antialiased(lambda y, x, width_m: covered(x - 0.25, width_m), y_m, x_m, 1.0).round(3).tolist()
+        [[0.75, 0.0]]
+    """
     # Over the diagonal of a pixel no edge can hide: what is neither 0 nor 1 there needs a closer look.
-    pupil = lit(y_m, x_m, np.sqrt(2) * grid.pixel_m)
+    pupil = lit(y_m, x_m, np.sqrt(2) * pixel_m)
     edge = (pupil > 0) & (pupil < 1)
-    part_m = grid.pixel_m / SUBPIXELS
+    part_m = pixel_m / SUBPIXELS
     steps_m = (np.arange(SUBPIXELS) - (SUBPIXELS - 1) / 2) * part_m
     y_parts_m = y_m[edge][:, None, None] + steps_m[:, None]
     x_parts_m = x_m[edge][:, None, None] + steps_m[None, :]
     pupil[edge] = lit(y_parts_m, x_parts_m, part_m).mean(axis=(1, 2))
     return pupil
+
+
+def _on_grid(lit: Callable[[np.ndarray, np.ndarray, float], np.ndarray], grid: Grid) -> np.ndarray:
+    y_m, x_m = np.broadcast_arrays(grid.y_m, grid.x_m)
+    return antialiased(lit, y_m, x_m, grid.pixel_m)
 
 
 def nearest_lit(lit: Bool[np.ndarray, "y x"]) -> Int[np.ndarray, "y x"]:

@@ -24,6 +24,7 @@ from nlcwfs.commands.reconstruct_report import (
     header_lines,
     result_lines,
     sequence_line,
+    step_lines,
 )
 from nlcwfs.config import Config, load_config
 from nlcwfs.errors import FileFormatError, SettingsError
@@ -100,7 +101,7 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
         kept = f"{len(done)} frames are in {options.out}, {left} are not run; go on with --resume"
         complain(f"interrupted: {kept}" if done else "interrupted before the first frame: nothing was written")
         return Result(frames, wavefront, INTERRUPTED)
-    for line in result_lines(wavefront, light_lost(reconstructor, done)):
+    for line in [*result_lines(wavefront, light_lost(reconstructor, done)), *step_lines(frames, wavefront)]:
         say(line, quiet=options.quiet)
     written = [str(options.out)]
     if options.plot is not None and done:

@@ -4,13 +4,17 @@ from collections import Counter
 
 import numpy as np
 
+from nlcwfs.beam.pupil import inside
 from nlcwfs.commands.console import percent
+from nlcwfs.curvature_sensor.step_visibility import SeenPlanes, unseen_step
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.interop import FramesFile, WavefrontFile
 from nlcwfs.interop.frame_times import FrameTimes
 from nlcwfs.interop.frames_reconstruction import FramesReconstructor, is_success
+from nlcwfs.interop.frames_sensor import pupil_on_frame, sensor_geometry
 from nlcwfs.interop.mirror_twin import twin_warning
 from nlcwfs.interop.sequence_reconstruction import FOLLOWED
+from nlcwfs.simulation.segment_score import segment_score
 
 FEW_FRAMES = 20
 """Up to here each frame gets a line, beyond only those that failed."""
@@ -21,6 +25,8 @@ def frame_warnings(frames: FramesFile) -> list[str]:
     found = list(frames.warnings)
     if frames.bandwidth_m > 0:
         found.append(f"BANDWID: {frames.bandwidth_m:g} m are treated as one colour, {frames.wavelength_m:g} m")
+    usable = [number for number in range(len(frames.electrons)) if number not in frames.frame_problems]
+    found += step_warning(frames, float(np.median(frames.photo_electrons()[usable].sum(axis=(1, 2, 3)))))
     twin = twin_warning(frames)
     found += [] if twin is None else [twin]
     found += [f"frame {number} is left out: it {problem}" for number, problem in frames.frame_problems.items()][:10]
@@ -97,6 +103,49 @@ def result_lines(wavefront: WavefrontFile, lost: np.ndarray | None) -> list[str]
     if followed:
         lines.append(f"Followed: {followed} frames; reconstructed alone: {int(wavefront.ran.sum()) - followed}.")
     return lines
+
+
+def step_warning(frames: FramesFile, electrons: float) -> list[str]:
+    """Segments whose light meets that of no other on any plane: nothing tells their step."""
+    geometry = sensor_geometry(frames)
+    labels = geometry.pupil.labels(geometry.frame)
+    if labels is None:
+        return []
+    planes = SeenPlanes(frames.distances_m, frames.wavelength_m, frames.flux_fractions)
+    found = unseen_step(pupil_on_frame(geometry), labels, geometry.frame, photons=electrons, planes=planes)
+    if found is None:
+        return []
+    return [
+        f"SEGMENTS: the step of segment {found[0] + 1} is not observable, {found[1]:.2g} electrons tell it: its light "
+        "meets that of no other segment on these planes"
+    ]
+
+
+def step_lines(frames: FramesFile, wavefront: WavefrontFile) -> list[str]:
+    """What is known of the steps between segments: modulo the wavelength, and how good where there is a TRUTH."""
+    if frames.segments is None:
+        return []
+    count, nm = int(frames.segments.max()) + 1, frames.wavelength_m * 1e9
+    lines = [f"Segments: {count}. One color tells the steps between them only up to whole wavelengths of {nm:.0f} nm."]
+    good = [number for number, outcome in enumerate(wavefront.outcomes) if is_success(outcome)]
+    if frames.truth_m is None or not good:
+        return lines
+    pupil = np.ones(frames.segments.shape) if frames.pupil is None else frames.pupil
+    weights = np.where(inside(pupil), pupil**2, 0)
+    truths_m = np.broadcast_to(frames.truth_m, wavefront.opd_m.shape)
+    scores = [
+        segment_score(wavefront.opd_m[number] - truths_m[number], weights, frames.segments, wavelength_m=nm * 1e-9)
+        for number in good
+    ]
+    piston_nm, inside_nm = (
+        np.median([getattr(one, name) for one in scores]) * 1e9 for name in ("piston_modulo_m", "inside_m")
+    )
+    off = sum(any(one.turns) for one in scores)
+    return [
+        *lines,
+        f"Steps: error {piston_nm:.2g} nm rms modulo the wavelength, {inside_nm:.1f} nm inside the segments (median, "
+        f"against TRUTH); whole wavelengths off in {off} of {len(scores)} frames.",
+    ]
 
 
 def frame_line(wavefront: WavefrontFile, number: int) -> str:

@@ -11,6 +11,7 @@ from nlcwfs.beam.sampling import check_sampling
 from nlcwfs.beam.sampling_cost import SensedLight, light_outside
 from nlcwfs.commands.console import device, percent, say, tracked, use_precision, warn
 from nlcwfs.config import Config, load_config
+from nlcwfs.curvature_sensor.step_visibility import SeenPlanes, unseen_step
 from nlcwfs.errors import SamplingError, SettingsError
 from nlcwfs.interop import FramesFile, Provenance, check_writable, write_frames
 from nlcwfs.interop.frames_reconstruction import rms_m
@@ -71,6 +72,7 @@ def simulate(config: Config, options: SimulateOptions) -> None:
     else:
         warnings += [NO_LENGTH] if starlit and options.warnings else []
         sequence, simulator, rate_hz = None, ExposureSimulator.build(config, pupil_of(config)), None
+        check_steps(config, simulator)
         shots = expose_all(config, simulator, quiet=options.quiet)
     frames = frames_of(config, simulator, shots, rate_hz=rate_hz)
     write_frames(options.out, frames, stamp, unit="adu" if options.adu else "electron")
@@ -123,6 +125,24 @@ def sensed_light(config: Config) -> SensedLight:
     """The light that the detector has to sample."""
     fried_m = turbulence(config).fried_at(wavelength_m(config))
     return SensedLight(config.beam.diameter_m, wavelength_m(config), fried_m=fried_m)
+
+
+def check_steps(config: Config, simulator: ExposureSimulator) -> None:
+    """Refuse planes on which the light of some segment meets that of no other.
+
+    Raises:
+        SettingsError: If there is such a segment; says by how many photons its step is told.
+    """
+    labels = simulator.shape.labels(simulator.frame)
+    if labels is None:
+        return
+    sensor, grid = config.curvature_sensor, simulator.frame
+    planes = SeenPlanes(distances_m(config), wavelength_m(config), sensor.flux_fractions)
+    found = unseen_step(simulator.shape.on(grid), labels, grid, photons=config.atmosphere.photons, planes=planes)
+    if found is not None:
+        rule = "must be so far out that light crosses the gaps between segments: the step of segment "
+        rule += f"{found[0]} is not observable, {found[1]:.2g} photons tell it"
+        raise SettingsError("curvature_sensor.distances_km", rule, list(sensor.distances_km))
 
 
 def sampling_warnings(config: Config, light: SensedLight) -> list[str]:

@@ -55,6 +55,9 @@ def unwrapped(
         missed = [_difference(smooth, axis) - goal for axis, goal in enumerate(wanted)]
         weights = [pair / (NOISE * (1 + (miss / OUTLIER_RAD) ** 2)) for pair, miss in zip(pairs, missed, strict=True)]
     rest = phase_rad - smooth
+    if prior.steps is not None:  # differences tell nothing of a step across a gap
+        offset = prior.steps.mean_turns(rest)
+        return smooth + offset + known * wrap(rest - offset)
     offset = jnp.arctan2(jnp.sum(known * jnp.sin(rest)), jnp.sum(known * jnp.cos(rest)))
     return smooth + known * wrap(rest - offset)
 
@@ -102,7 +105,10 @@ def _preconditioner(prior: WhitenedPhase) -> Unknown:
     steps = (4 - 2 * np.cos(turn_y) - 2 * np.cos(turn_x)) / NOISE
     slopes = jnp.stack([jnp.sum(_difference(prior.tilt[axis], axis)[:-1, :-1] ** 2) for axis in (0, 1)])
     waves = 1 / (1 + prior.amplitude**2 * jnp.asarray(steps, prior.amplitude.dtype))
-    return Unknown(waves, 1 / (1 + slopes / (8 * NOISE)))
+    slope = 1 / (1 + slopes / (8 * NOISE))
+    if prior.steps is not None:
+        slope = jnp.concatenate([slope, jnp.ones(3 * prior.steps.count, slope.dtype)])
+    return Unknown(waves, slope)
 
 
 def _difference(phase_rad: Float[Array, "y x"], axis: int) -> Float[Array, "y x"]:

@@ -21,6 +21,20 @@ class MapSettings(BaseModel):
         default=GerchbergSaxtonSettings(coarse_cutoffs_cpa=(2.0, 4.0, 8.0), iterations=5),
         description="how the first guess is found, coarse to fine",
     )
+    segment_capture: GerchbergSaxtonSettings = Field(
+        default=GerchbergSaxtonSettings(
+            scheme="serial",
+            amplitude="replace",
+            filter="none",
+            coarse_cutoffs_cpa=(),
+            iterations=50,
+            gain=1.0,
+            fast_forward=0.7,
+            tolerance_rad=0.002,
+            oversampling=2,
+        ),
+        description="the same on a pupil made of segments: on the field, whose steps no filter may smooth",
+    )
     wavelengths: int = Field(
         default=1,
         ge=1,

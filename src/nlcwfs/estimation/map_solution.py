@@ -200,6 +200,9 @@ def misfit(task: Task, model: Float[Array, "plane v u"]) -> Float[Array, ""]:
 def disagreement_rad(task: Task, a: Unknown, b: Unknown) -> Float[Array, ""]:
     """Rms over the pupil of the difference of two solutions, piston excluded."""
     difference = task.problem.prior.phase_rad(a) - task.problem.prior.phase_rad(b)
+    if task.prior.steps is not None:  # one colour does not tell whole turns of a segment
+        turns = task.prior.steps.means(difference) / (2 * jnp.pi)
+        difference = difference - 2 * jnp.pi * jnp.round(turns - turns.ravel()[jnp.argmax(task.level.weight)])
     weight = task.level.weight
     mean = jnp.sum(weight * difference)
     return jnp.sqrt(jnp.sum(weight * (difference - mean) ** 2))

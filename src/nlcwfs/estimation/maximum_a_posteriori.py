@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.estimation import gauss_newton as gn
+from nlcwfs.estimation.first_guess import segmented_start, with_strength
 from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share
 from nlcwfs.estimation.gerchberg_saxton import phase_noise
 from nlcwfs.estimation.ladder import finest_level
@@ -22,21 +23,17 @@ from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air, prior_power
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS, TYPICAL_SEEING_ARCSEC, Climb, GerchbergSaxton
 from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, sum_blocks
+from nlcwfs.estimation.segment_steps import SegmentSteps, steps_of
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.sensor_model import PlaneScale, light_on_pixels, mean_counts, plane_scale
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.speckle_blur import unmodelled_variance
 from nlcwfs.estimation.tilt import tilt_phase
-from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
 
 TILT_VARIANCE = 0.449
 """Variance of Kolmogorov's tilt along one axis over (D / r0)^(5/3), rad^2 (Noll 1976, table 4)."""
-
-SHOWN = 0.87
-"""Share of the strength that the slopes of a first guess show: 0.78 to 0.91 for D / r0 of 8 to 25 and 2e3 to 2e6
-photons, with a scatter of 0.12 to 0.18."""
 
 START_NOISE = 0.1
 """Share of the phase noise that is filtered from the first guess, which is smooth already."""
@@ -58,6 +55,7 @@ class MaximumAPosteriori(eqx.Module):
         beyond_cells: Variance of the phase beyond the model's cells, for strength 1, rad^2.
         band: See `speckle_band`.
         error: Tells the error bars.
+        steps: Of the segments of the pupil; None for a pupil of one piece.
 
     Examples:
         >>> from nlcwfs.beam.pupil_shape import PupilShape
@@ -80,6 +78,7 @@ class MaximumAPosteriori(eqx.Module):
     beyond_cells: Float[Array, ""]
     band: Float[Array, "v fu"]
     error: MapError
+    steps: SegmentSteps | None
     settings: EstimationSettings = eqx.field(static=True)
     geometry: SensorGeometry = eqx.field(static=True)
 
@@ -104,8 +103,10 @@ class MaximumAPosteriori(eqx.Module):
         if settings.prior.fried_m is not None:
             told = SEEING_TO_FRIED * SEEING_WAVELENGTH_M / (settings.prior.fried_m * ARCSEC_RAD)
             settings = settings.model_copy(update={"seeing_arcsec": told})
-        first = settings.model_copy(update={"gerchberg_saxton": options.capture, "unwrapping": "carried"})
         level = finest_level(geometry, air, oversampling=options.oversampling, window=options.window, dtype=dtype)
+        steps = steps_of(geometry, level, settings.prior, dtype=dtype)
+        start = options.capture if steps is None else options.segment_capture
+        first = settings.model_copy(update={"gerchberg_saxton": start, "unwrapping": "carried"})
         capture = GerchbergSaxton.build(geometry, first, dtype=dtype)
         if settings.prior.cutoff_cpa is None:
             # What is told is where the measuring starts: taken as it is, half the seeing loses a tenth of the frames.
@@ -126,6 +127,7 @@ class MaximumAPosteriori(eqx.Module):
                 speckle_band(Grid(level.measured_shape, geometry.frame.pixel_m), diameter_m=diameter_m), dtype
             ),
             error=MapError.build(geometry, settings, level, air, dtype=dtype),
+            steps=steps,
             settings=settings,
             geometry=geometry,
         )
@@ -165,7 +167,7 @@ class MaximumAPosteriori(eqx.Module):
         slope, climb = self.capture.search(near, start_m)
         if mirror_rad is not None:
             climb = eqx.tree_at(lambda c: c.phase_rad, climb, climb.phase_rad + self.on_capture(mirror_rad))
-        climb = eqx.tree_at(lambda c: c.strength, climb, self.measured_strength(near, climb))
+        climb = with_strength(self.capture, near, climb) if self.steps is None else self.on_segments(near, climb)
         task, unknown = self.prepared(near, slope, climb, mirror_rad)
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
         return Found(task, search, slope, climb.strength)
@@ -175,16 +177,22 @@ class MaximumAPosteriori(eqx.Module):
         factor = self.level.oversampling
         return cropped(sum_blocks(phase_rad[None], factor)[0] / factor**2, self.capture.levels[-1].grid.shape)
 
-    def measured_strength(self, near: Measurement, climb: Climb) -> Float[Array, ""]:
-        """The strength that the first guess shows: the coarse levels on the way could not see its fine waves."""
-        level, strength = self.capture.levels[-1], climb.strength
-        if not self.capture.measures_strength:
-            return strength
-        weights = jnp.asarray(slope_weights(level.grid), strength.dtype)
-        noise = SENSOR_LOSS * phase_noise(level, near)
-        for _ in range(2):
-            strength = updated_strength(strength, climb.phase_rad, level.light, level.power[0], weights, noise)
-        return strength / SHOWN
+    def on_segments(self, near: Measurement, climb: Climb) -> Climb:
+        """The first guess of a field, unwrapped segment by segment on the model's grid, and the strength it shows."""
+        prior = self.prior(self.power * climb.strength, self.tilt_rms_rad * jnp.sqrt(climb.strength))
+        noise = SENSOR_LOSS * phase_noise(self.level, near)
+        wrapped_rad = self.on_model(climb.phase_rad, near)
+        return segmented_start(self.level, prior, climb, wrapped_rad, noise, learns=self.capture.measures_strength)
+
+    def on_model(self, phase_rad: Float[Array, "y x"], near: Measurement) -> Float[Array, "v u"]:
+        """The first guess on the grid of the model, going on as it ends beyond the frames."""
+        level = self.level
+        if phase_rad.shape == level.grid.shape:
+            return phase_rad
+        fine = [size * level.oversampling for size in near.counts.shape[1:]]
+        phase_rad = jax.image.resize(phase_rad, fine, method="cubic").astype(phase_rad.dtype)
+        margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
+        return jnp.pad(phase_rad, margins, mode="edge")
 
     def prepared(
         self,
@@ -195,10 +203,7 @@ class MaximumAPosteriori(eqx.Module):
     ) -> tuple[Task, Unknown]:
         """The task of one exposure and the first guess, on the grid of the model."""
         level = self.level
-        fine = [size * level.oversampling for size in near.counts.shape[1:]]
-        phase_rad = jax.image.resize(climb.phase_rad, fine, method="cubic").astype(climb.phase_rad.dtype)
-        margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
-        phase_rad = jnp.pad(phase_rad, margins, mode="edge")
+        phase_rad = self.on_model(climb.phase_rad, near)
         measured = near.padded(level.measured_shape)
         known_rad = self.known_rad(slope) - (0 if mirror_rad is None else mirror_rad)
         scale = self.plane_scale(measured, known_rad + phase_rad)
@@ -221,7 +226,9 @@ class MaximumAPosteriori(eqx.Module):
     def prior(self, power: Float[Array, "y fx"], tilt_rms_rad: Float[Array, ""]) -> WhitenedPhase:
         """Unknowns for this power."""
         diameter_m = self.geometry.pupil.diameter_m
-        return WhitenedPhase.build(self.level.grid, power, tilt_rms_rad=tilt_rms_rad, diameter_m=diameter_m)
+        return WhitenedPhase.build(
+            self.level.grid, power, tilt_rms_rad=tilt_rms_rad, diameter_m=diameter_m, steps=self.steps
+        )
 
     def task(
         self,

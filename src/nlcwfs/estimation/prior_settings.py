@@ -56,3 +56,9 @@ class PriorSettings(BaseModel):
     beyond_share: float = Field(
         default=1.0, gt=0, le=1, description="share of the turbulence that is expected beyond the mirror's cutoff"
     )
+    segment_piston_nm: float = Field(
+        default=1000.0, ge=0, description="rms piston of the segments of a pupil that is expected beside the air"
+    )
+    segment_tilt_nm: float = Field(
+        default=100.0, ge=0, description="the same for their tilt along one axis, rms over a segment; 0 = rigid"
+    )

@@ -94,7 +94,8 @@ class GerchbergSaxton(eqx.Module):
         weaker = (1 / FIRST_STRENGTH_AT_FRIED / telescope_over_fried) ** (5 / 3) if measures else 1.0
         unwrapper = None
         if settings.unwrapping == "slopes" and basis is not None:
-            unwrapper = SlopeUnwrapper.build(basis, passes=settings.remainder_passes, dtype=dtype)
+            labels = geometry.pupil.labels(geometry.frame)
+            unwrapper = SlopeUnwrapper.build(basis, passes=settings.remainder_passes, labels=labels, dtype=dtype)
         levels = build_ladder(geometry, settings.gerchberg_saxton, air, dtype=dtype)
         finest, diameter_m = levels[-1].grid, geometry.pupil.diameter_m
         beyond = unmodelled_variance(air, wavelength_m=geometry.wavelength_m, cutoff_per_m=1 / (2 * finest.pixel_m))

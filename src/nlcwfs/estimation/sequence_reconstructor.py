@@ -83,6 +83,9 @@ class SequenceReconstructor(eqx.Module):
         """
         if not interval_s > 0 or not photons > 0:
             raise SettingsError("interval_s and photons", "must be positive", (interval_s, photons))
+        if geometry.pupil.is_segmented:
+            rule = "must be one piece to be followed from frame to frame; frames on their own may have segments"
+            raise SettingsError("pupil", rule, "segments")
         planes, options, prior = len(geometry.distances_m), settings.map, settings.prior
         inner = inner_steps(
             planes,

@@ -42,12 +42,15 @@ class SlopeUnwrapper(eqx.Module):
     passes: int = eqx.field(static=True)
 
     @classmethod
-    def build(cls, basis: ModalBasis, *, passes: int, dtype: str = "float32") -> "SlopeUnwrapper":
+    def build(
+        cls, basis: ModalBasis, *, passes: int, labels: Int[np.ndarray, "y x"] | None = None, dtype: str = "float32"
+    ) -> "SlopeUnwrapper":
         """Precompute the projection of slopes for a basis.
 
         Args:
             basis: Modes on the pixels of the phase.
             passes: How often the wrapped remainder is projected back on the modes.
+            labels: Segment of each pixel: a step between two is no slope. The remainder tells it, within half a turn.
             dtype: Precision of the projection.
 
         Examples:
@@ -75,6 +78,9 @@ class SlopeUnwrapper(eqx.Module):
         ]
         first = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
         second = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+        if labels is not None:
+            same = labels[rows, columns][first] == labels[rows, columns][second]
+            first, second = first[same], second[same]
         modes = np.asarray(basis.modes, float)[:, rows, columns]
         lit_weights = weights[rows, columns]
         pair_weights = np.minimum(lit_weights[first], lit_weights[second])

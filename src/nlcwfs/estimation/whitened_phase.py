@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.estimation.segment_steps import SegmentSteps
 from nlcwfs.estimation.turbulence_filter import times_counted
 
 FILL = 0.15
@@ -20,11 +21,11 @@ class Unknown(NamedTuple):
 
     Attributes:
         waves: Half-plane of Fourier coefficients (`rfft2`, orthonormal); or, of a `ModalPrior`, real unknowns.
-        slope: Tilt along y and x: a window that repeats itself cannot hold one.
+        slope: Tilt along y and x: a window that repeats itself cannot hold one. Then the steps of a segmented pupil.
     """
 
     waves: Complex[Array, "y fx"] | Float[Array, " unknown"]
-    slope: Float[Array, "2"]
+    slope: Float[Array, " ramp"]
 
 
 class WhitenedPhase(eqx.Module):
@@ -34,6 +35,7 @@ class WhitenedPhase(eqx.Module):
         amplitude: Root of the expected power P of each wave (see `turbulence_filter.expected_power`).
         tilt: Phase of a tilt of the expected rms along y and along x.
         twice: How often a stored wave counts: its conjugate is not stored.
+        steps: Piston, tip and tilt of each segment of the pupil; None for a pupil of one piece.
 
     Examples:
         >>> import jax.numpy as jnp
@@ -48,10 +50,17 @@ class WhitenedPhase(eqx.Module):
     amplitude: Float[Array, "y fx"]
     tilt: Float[Array, "2 y x"]
     twice: Float[Array, "1 fx"]
+    steps: SegmentSteps | None = None
 
     @classmethod
     def build(
-        cls, grid: Grid, power: Float[Array, "y fx"], *, tilt_rms_rad: float | Float[Array, ""], diameter_m: float
+        cls,
+        grid: Grid,
+        power: Float[Array, "y fx"],
+        *,
+        tilt_rms_rad: float | Float[Array, ""],
+        diameter_m: float,
+        steps: SegmentSteps | None = None,
     ) -> "WhitenedPhase":
         """Unknowns of a phase with this power.
 
@@ -60,6 +69,7 @@ class WhitenedPhase(eqx.Module):
             power: Variance of each wave where white noise of unit variance has 1.
             tilt_rms_rad: Rms over a disc of the tilt expected along one axis, beside the waves.
             diameter_m: Diameter of the disc.
+            steps: Of a segmented pupil, beside all that.
         """
         # Noll's tilt of unit rms is 2 r / R.
         y, x = np.broadcast_to(grid.y_m, grid.shape), np.broadcast_to(grid.x_m, grid.shape)
@@ -68,17 +78,22 @@ class WhitenedPhase(eqx.Module):
             amplitude=jnp.sqrt(power),
             tilt=jnp.asarray(unit, power.dtype) * jnp.asarray(tilt_rms_rad, power.dtype),
             twice=jnp.asarray(times_counted(grid.shape[1]), power.dtype),
+            steps=steps,
         )
 
     def phase_rad(self, unknown: Unknown) -> Float[Array, "y x"]:
         """The phase of these unknowns."""
         waves = jnp.fft.irfft2(scaled(unknown.waves, self.amplitude), s=self.tilt.shape[1:], norm="ortho")
-        return waves.astype(self.amplitude.dtype) + jnp.tensordot(unknown.slope, self.tilt, axes=1)
+        smooth = waves.astype(self.amplitude.dtype) + jnp.tensordot(unknown.slope[:2], self.tilt, axes=1)
+        return smooth if self.steps is None else smooth + self.steps.phase_rad(unknown.slope[2:])
 
     def transposed(self, gradient: Float[Array, "y x"]) -> Unknown:
         """The transpose of `phase_rad` in the inner product `dot`."""
         waves = scaled(jnp.fft.rfft2(gradient, norm="ortho"), self.amplitude)
-        return Unknown(waves, jnp.tensordot(self.tilt, gradient, axes=2))
+        slope = jnp.tensordot(self.tilt, gradient, axes=2)
+        if self.steps is not None:
+            slope = jnp.concatenate([slope, self.steps.transposed(gradient)])
+        return Unknown(waves, slope)
 
     def dot(self, a: Unknown, b: Unknown) -> Float[Array, ""]:
         """Inner product; of an unknown with itself twice its negative logarithm of the prior."""
@@ -89,14 +104,23 @@ class WhitenedPhase(eqx.Module):
         """The unknowns of the flat phase."""
         dtype = self.amplitude.dtype
         kind = jnp.complex128 if dtype == jnp.float64 else jnp.complex64
-        return Unknown(jnp.zeros_like(self.amplitude, kind), jnp.zeros(2, dtype))
+        count = 0 if self.steps is None else 3 * self.steps.count
+        return Unknown(jnp.zeros_like(self.amplitude, kind), jnp.zeros(2 + count, dtype))
 
     def start(self, phase_rad: Float[Array, "y x"], *, noise_variance: float | Float[Array, ""]) -> Unknown:
-        """The unknowns of a phase that is known up to white noise (rad^2 per pixel); it holds no tilt of its own."""
+        """The unknowns of a phase that is known up to white noise (rad^2 per pixel); it holds no tilt of its own.
+
+        What is straight on a segment counts as its step; beyond the light the rest goes on as it ends.
+        """
+        slope = jnp.zeros(2, self.amplitude.dtype)
+        if self.steps is not None:
+            found = self.steps.fitted(phase_rad)
+            phase_rad = self.steps.spread(phase_rad - self.steps.phase_rad(found))
+            slope = jnp.concatenate([slope, found])
         spectrum = jnp.fft.rfft2(phase_rad, norm="ortho")
         tiny = jnp.finfo(self.amplitude.dtype).tiny
         waves = scaled(spectrum, self.amplitude / (self.amplitude**2 + noise_variance + tiny))
-        return Unknown(waves, jnp.zeros(2, self.amplitude.dtype))
+        return Unknown(waves, slope)
 
     def preconditioner(self, information: Float[Array, ""], shown: Unknown) -> Unknown:
         """Inverse of the diagonal of the curvature of a fit, `1 / (1 + fill * information * P)` for each wave.
@@ -108,7 +132,10 @@ class WhitenedPhase(eqx.Module):
         waves = 1 / (1 + FILL * information * shown.waves * self.amplitude**2)
         lit = jnp.sum(self.tilt**2, axis=(1, 2))
         # A tilt reaches beyond the pupil: a disc in a window holds at least an eighth of its squares.
-        return Unknown(waves, 1 / (1 + information * shown.slope * lit / 8))
+        slope = 1 / (1 + information * shown.slope * lit / 8)
+        if self.steps is not None:
+            slope = jnp.concatenate([slope, 1 / (1 + information * self.steps.squares())])
+        return Unknown(waves, slope)
 
 
 def scaled(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from nlcwfs.errors import SettingsError
 
@@ -30,6 +30,7 @@ class FramesFile:
         photons: Photo-electrons that the whole sensor is expected to have of the star in an exposure, if known.
         times_s: When each frame was taken, ascending; None for frames at `rate_hz`, or without an order in time.
         pupil: Amplitude of the pupil, 0 to 1; None for a circle with its obstruction.
+        segments: Segment of every pixel, from 0, where the pupil has several that may have steps between them.
         background: Background in electrons, one image for all planes or one per plane.
         bad_pixels: Pixels to ignore, one map for all planes or one per plane.
         truth_m: The true wavefront, one for all frames or one per frame; may be NaN outside the pupil.
@@ -72,6 +73,7 @@ class FramesFile:
     photons: float | None = None
     times_s: Float[np.ndarray, " frame"] | None = None
     pupil: Float[np.ndarray, "y x"] | None = None
+    segments: Int[np.ndarray, "y x"] | None = None
     background: Float[np.ndarray, "..."] | None = None
     bad_pixels: Bool[np.ndarray, "..."] | None = None
     truth_m: Float[np.ndarray, "..."] | None = None
@@ -89,6 +91,7 @@ class FramesFile:
         allowed = {
             "masked": (shape,),
             "pupil": (shape[2:],),
+            "segments": (shape[2:],),
             "background": (shape[2:], shape[1:]),
             "bad_pixels": (shape[2:], shape[1:]),
             "truth_m": (shape[2:], (shape[0], *shape[2:])),

@@ -22,10 +22,10 @@ from nlcwfs.interop.fits_keywords import (
 from nlcwfs.interop.frames_checks import PixelRules, examine_frame, frame_warnings
 from nlcwfs.interop.frames_file import FramesFile
 from nlcwfs.interop.frames_header import check_window, detector_fields, optics_fields, unit_and_gain
-from nlcwfs.interop.frames_maps import background_map, bad_pixel_map, frame_clock, pupil_map, truth_map
+from nlcwfs.interop.frames_maps import background_map, bad_pixel_map, frame_clock, pupil_map, segment_map, truth_map
 from nlcwfs.interop.provenance import Provenance
 
-MAPS = ("PUPIL", "BACKGROUND", "BADPIX", "TRUTH", "TIME")
+MAPS = ("PUPIL", "SEGMENTS", "BACKGROUND", "BADPIX", "TRUTH", "TIME")
 
 
 def read_frames(path: str | Path) -> FramesFile:
@@ -111,7 +111,14 @@ def write_frames(
     hdus: list[Any] = [fits.PrimaryHDU(image, header_of(cards))]
     background = None if frames.background is None else frames.background / electrons_per_unit
     bad = None if frames.bad_pixels is None else frames.bad_pixels.astype(np.uint8)
-    maps = {"PUPIL": frames.pupil, "BACKGROUND": background, "BADPIX": bad, "TRUTH": frames.truth_m}
+    segments = None if frames.segments is None else (frames.segments + 1).astype(np.int16)
+    maps = {
+        "PUPIL": frames.pupil,
+        "SEGMENTS": segments,
+        "BACKGROUND": background,
+        "BADPIX": bad,
+        "TRUTH": frames.truth_m,
+    }
     units = {"BACKGROUND": unit, "TRUTH": "m"}
     for name, data in maps.items():
         if data is not None:
@@ -147,6 +154,8 @@ def _read_maps(
     if "PUPIL" in parts:
         scale = {name: fields[name] for name in ("diameter_m", "pixel_m")}
         maps["pupil"], notes = pupil_map(keywords, parts["PUPIL"], planes[1:], **scale)
+    if "SEGMENTS" in parts:
+        maps["segments"] = segment_map(keywords, parts["SEGMENTS"], planes[1:], maps.get("pupil"))
     if "BADPIX" in parts:
         maps["bad_pixels"] = bad_pixel_map(keywords, parts["BADPIX"], planes)
     if "BACKGROUND" in parts:

@@ -1,8 +1,9 @@
-"""The optional HDUs of a frames file: PUPIL, BACKGROUND, BADPIX, TRUTH and TIME, and the rules they must keep."""
+"""The optional HDUs of a frames file: PUPIL, SEGMENTS, BACKGROUND, BADPIX, TRUTH and TIME, and their rules."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.interop.fits_keywords import Hdu, Keywords
 
 OPD_LIMIT_M = 1e-3
@@ -32,6 +33,27 @@ def pupil_map(
     if abs(extent_m - diameter_m) > 0.1 * diameter_m + 2 * pixel_m:
         return pupil, [f"PUPIL: is {extent_m:.3g} m wide, but TELDIAM is {diameter_m:g} m; is PIXSCALE right?"]
     return pupil, []
+
+
+def segment_map(
+    keywords: Keywords, part: Hdu, shape: tuple[int, int], pupil: Float[np.ndarray, "y x"] | None
+) -> Int[np.ndarray, "y x"]:
+    """Segment of every pixel, from 0; pixels of none belong to the nearest.
+
+    Raises:
+        FileFormatError: If it has another shape than a plane, holds no whole numbers, or a segment has no light.
+    """
+    written = _image(keywords, "SEGMENTS", part, (shape,))
+    _check_finite(keywords, "SEGMENTS", written)
+    rule = "must be whole numbers, 0 for no segment"
+    if np.any(written != np.round(written)) or written.min() < 0 or not written.any():
+        raise keywords.error("SEGMENTS", rule, f"{written.min():g} to {written.max():g}")
+    names = np.unique(written[written > 0])
+    for name in names:
+        if pupil is not None and not np.any(pupil[written == name] >= 0.5):
+            raise keywords.error("SEGMENTS", "must have a pixel with PUPIL >= 0.5 in each segment", f"{name:g} without")
+    labels = np.searchsorted(names, written)
+    return labels[written > 0][nearest_lit(written > 0)]
 
 
 def bad_pixel_map(keywords: Keywords, part: Hdu, shape: tuple[int, int, int]) -> Bool[np.ndarray, "..."]:

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
-from nlcwfs.beam.modes import ModalBasis, modal_basis
-from nlcwfs.beam.pupil import inside, light_weights
+from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.zernike import ZernikeFit
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
@@ -20,6 +19,7 @@ from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.unwrapping_basis import unwrapping_basis
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_file import FramesFile
 from nlcwfs.interop.frames_sensor import scored_pupil, sensor_geometry, well_seen_zernikes
@@ -89,7 +89,7 @@ class FramesReconstructor(eqx.Module):
         # filter told eleven times too strong a turbulence finds 2 % of the paper's frames (study 01, seeing-0.6).
         geometry = sensor_geometry(frames)
         slopes = settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes"
-        basis = _basis(scored_pupil(geometry), geometry, settings) if slopes else None
+        basis = unwrapping_basis(geometry, scored_pupil(geometry), modes=settings.modes) if slopes else None
         solver = build_reconstructor(geometry, settings, basis=basis, dtype=dtype)
         return cls.around(frames, settings, solver, dtype=dtype)
 
@@ -241,9 +241,3 @@ def is_success(name: str) -> bool:
         (True, False, False)
     """
     return any(outcome.succeeded and outcome_name(outcome) == name for outcome in Outcome)
-
-
-def _basis(pupil: Float[np.ndarray, "y x"], geometry: SensorGeometry, settings: EstimationSettings) -> ModalBasis:
-    carried = int(0.7 * np.sum(inside(pupil)))  # pi / 4 of the pixels is half a cycle per pixel, less the rim
-    count = max(1, min(settings.modes, carried))
-    return modal_basis(pupil, geometry.frame, diameter_m=geometry.pupil.diameter_m, count=count)

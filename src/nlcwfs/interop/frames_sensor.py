@@ -28,10 +28,11 @@ def sensor_geometry(frames: FramesFile) -> SensorGeometry:
         >>> sensor_geometry(frames).frame.shape
         (8, 9)
     """
+    maps = {"map_pixel_m": frames.pixel_m, "label_map": frames.segments}
     if frames.pupil is None:
-        shape = PupilShape(frames.diameter_m, frames.obstruction_ratio)
+        shape = PupilShape(frames.diameter_m, frames.obstruction_ratio, **maps)
     else:
-        shape = PupilShape(frames.diameter_m, amplitude_map=frames.pupil, map_pixel_m=frames.pixel_m)
+        shape = PupilShape(frames.diameter_m, amplitude_map=frames.pupil, **maps)
     return SensorGeometry(
         pupil=shape,
         frame=Grid(frames.electrons.shape[2:], frames.pixel_m),

@@ -18,10 +18,10 @@ from nlcwfs.simulation.exposure import (
     Exposure,
     ExposureSimulator,
     distances_m,
-    round_pupil,
     seeing_arcsec,
     wavelength_m,
 )
+from nlcwfs.simulation.telescope import telescope
 
 
 def pupil_of(config: Config) -> PupilShape:
@@ -36,7 +36,7 @@ def pupil_of(config: Config) -> PupilShape:
     """
     beam = config.beam
     if beam.pupil_map is None:
-        return round_pupil(config)
+        return telescope(config)
     return read_pupil_shape(beam.pupil_map, diameter_m=beam.diameter_m)
 
 
@@ -110,6 +110,7 @@ def frames_of(
         flux_fractions=config.curvature_sensor.flux_fractions,
         seeing_arcsec=seeing_arcsec(simulator.air),
         pupil=simulator.shape.on(grid),
+        segments=simulator.shape.labels(grid),
         background=np.full(grid.shape, background) if background else None,
         truth_m=truth_m if several else truth_m[0],
         source="simulation",

@@ -11,16 +11,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.pupil import Spiders, light_weights
+from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
-from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.colours import colours_of
+from nlcwfs.simulation.segment_aberrations import SegmentAberrations
 from nlcwfs.simulation.static_aberration import lit_part, static_aberration
+from nlcwfs.simulation.telescope import telescope
 
 SMALLEST_LIGHT = 1e-6
 """Light of a detector pixel, over a fully lit one, below which it has no wavefront."""
@@ -65,6 +66,7 @@ class ExposureSimulator(eqx.Module):
         photons: Photons that the whole sensor gets in one exposure.
         factor: Cells of the light along a detector pixel.
         window: Detector pixels along y and x.
+        stand: How the segments of the pupil stand; None where they stand still, or there are none.
 
     Examples:
         >>> from nlcwfs.config import load_config
@@ -86,6 +88,7 @@ class ExposureSimulator(eqx.Module):
     photons: float = eqx.field(static=True)
     factor: int = eqx.field(static=True)
     window: tuple[int, int] = eqx.field(static=True)
+    stand: SegmentAberrations | None = None
 
     @classmethod
     def build(cls, config: Config, shape: PupilShape | None = None) -> "ExposureSimulator":
@@ -100,7 +103,7 @@ class ExposureSimulator(eqx.Module):
             SamplingError: If the pupil does not fit in the window.
         """
         dtype = "float64" if config.precision == "double" else "float32"
-        shape, air = round_pupil(config) if shape is None else shape, turbulence(config)
+        shape, air = telescope(config) if shape is None else shape, turbulence(config)
         light = light_grid(config)
         pupil = shape.on(light)
         cut = lit_part(pupil)
@@ -128,6 +131,7 @@ class ExposureSimulator(eqx.Module):
             photons=config.atmosphere.photons,
             factor=config.simulation.light_oversampling,
             window=window,
+            stand=SegmentAberrations.build(config.beam.segments, shape, light, pupil, dtype=dtype),
         )
 
     @property
@@ -143,7 +147,10 @@ class ExposureSimulator(eqx.Module):
             key: Random key of this frame, see `frame_key`.
         """
         key_sky, key_detector = jax.random.split(key)
-        return self.expose_to(self.on_light(self.screens.draw(key_sky)), key_detector)
+        opd_m = self.on_light(self.screens.draw(key_sky))
+        if self.stand is not None:
+            opd_m = opd_m + self.stand.draw(key)
+        return self.expose_to(opd_m, key_detector)
 
     @eqx.filter_jit
     def expose_to(self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray) -> Exposure:
@@ -213,21 +220,6 @@ def wavelength_m(config: Config) -> float:
 def distances_m(config: Config) -> tuple[float, ...]:
     """Signed distance of every plane from the pupil."""
     return tuple(distance_km * 1e3 for distance_km in config.curvature_sensor.distances_km)
-
-
-def round_pupil(config: Config) -> PupilShape:
-    """The round telescope of a configuration.
-
-    Raises:
-        SettingsError: If the configuration names a map instead: reading files is not for this stage.
-    """
-    beam = config.beam
-    if beam.pupil_map is not None:
-        raise SettingsError("beam.pupil_map", "must be read first and handed over as a shape", beam.pupil_map)
-    spiders = None
-    if beam.spider_count:
-        spiders = Spiders.evenly(beam.spider_count, width_m=beam.spider_width_m, first_angle_deg=beam.spider_angle_deg)
-    return PupilShape(beam.diameter_m, beam.obstruction_ratio, spiders)
 
 
 def turbulence(config: Config) -> Turbulence:

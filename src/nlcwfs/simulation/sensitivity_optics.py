@@ -18,10 +18,11 @@ from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.speckle_blur import blurred
 from nlcwfs.simulation.colours import refuse_colours
-from nlcwfs.simulation.exposure import distances_m, round_pupil, wavelength_m
+from nlcwfs.simulation.exposure import distances_m, wavelength_m
 from nlcwfs.simulation.sensitivity import Optics
 from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
 from nlcwfs.simulation.static_aberration import static_aberration
+from nlcwfs.simulation.telescope import telescope
 
 
 def optics_of(case: SensitivityCase, config: Config, question: SensitivityQuestion, air: Turbulence | None) -> Optics:
@@ -63,7 +64,7 @@ def _curvature(config: Config, cells: LightCells, binning: int) -> Optics:
         size += 1
     diameter_m, colour_m = config.beam.diameter_m, wavelength_m(config)
     grid = Grid((size, size), diameter_m / across)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     weights = light_weights(pupil)
     sensor = CurvatureSensor.build(
         pupil,
@@ -94,7 +95,7 @@ def _lenslets(config: Config, air: Turbulence | None) -> Optics:
     settings, diameter_m, colour_m = config.shack_hartmann, config.beam.diameter_m, wavelength_m(config)
     fried_m = diameter_m if air is None else air.fried_at(colour_m)
     grid = lenslet_grid(settings, diameter_m=diameter_m, fried_m=fried_m)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     colours = Spectrum.monochromatic(colour_m)
     sensor = ShackHartmann.build(pupil, grid, diameter_m=diameter_m, spectrum=colours, settings=settings)
 
@@ -118,7 +119,7 @@ def _pyramid(config: Config, cells: LightCells) -> Optics:
     """Four images of the pupil; how turbulence blurs them has no closed form."""
     across, diameter_m, colour_m = cells.across_pupil, config.beam.diameter_m, wavelength_m(config)
     grid = Grid((across, across), diameter_m / across)
-    pupil = round_pupil(config).on(grid)
+    pupil = telescope(config).on(grid)
     colours = Spectrum.monochromatic(colour_m)
     sensor = Pyramid.build(pupil, grid, diameter_m=diameter_m, spectrum=colours, settings=config.pyramid)
 

@@ -62,14 +62,17 @@ class SequenceSimulator(eqx.Module):
             pupil: Its shape, as for `ExposureSimulator.build`.
 
         Raises:
-            SettingsError: If there is no rate, if the air would repeat before the last frame, or if settings contradict
-                each other.
+            SettingsError: If there is no rate, if the air would repeat before the last frame, if segments do not stand
+                still, or if settings contradict each other.
             SamplingError: If the pupil does not fit in the window.
         """
         rate_hz = config.simulation.rate_hz
         if rate_hz is None:
             raise SettingsError("simulation.rate_hz", "must be given for a sequence (--rate HZ)", "nothing")
         still = ExposureSimulator.build(config, pupil)
+        if still.stand is not None:
+            rule = "must have no pistons and tilts in a sequence or a loop: only single exposures know them yet"
+            raise SettingsError("beam.segments", rule, config.beam.segments.layout)
         shape, pixel_m = (still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]), still.light.pixel_m
         period, layers = _period(config, max(shape), pixel_m), wind_layers(config)
         _check_duration(config, unrepeated_s(layers, shape=shape, pixel_m=pixel_m, period=period), rate_hz)

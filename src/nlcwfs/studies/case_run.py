@@ -10,21 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.modes import modal_basis
 from nlcwfs.config import Config
 from nlcwfs.detector.read import Detector
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.method import Reconstructor, build_reconstructor
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.reconstructor import TYPICAL_SEEING_ARCSEC
+from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings
+from nlcwfs.estimation.unwrapping_basis import unwrapping_basis
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.simulation.exposure import ExposureSimulator, seeing_arcsec, turbulence, wavelength_m
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.score import wavefront_error_m
+from nlcwfs.simulation.segment_score import SegmentScore
 from nlcwfs.studies.mode_calibration import GROUPS_CPA, ModeErrors
+from nlcwfs.studies.step_columns import step_columns, step_errors, steps_captured
 from nlcwfs.studies.study_cases import Capture, Case
 from nlcwfs.studies.study_light import Light, Progress, Screen
 from nlcwfs.studies.study_table import Row
@@ -46,6 +48,7 @@ class Scored(NamedTuple):
         strength: Of the turbulence, as the estimate tells it.
         milliseconds: Time that it took.
         groups: Squares of the errors of the modes over what was told, by group; NaN where nothing was told.
+        steps: Errors of and inside the segments of the pupil; None for one piece.
     """
 
     fine_nm: float
@@ -57,24 +60,24 @@ class Scored(NamedTuple):
     strength: float
     milliseconds: float
     groups: dict[str, float]
+    steps: SegmentScore | None = None
 
 
-def build_solver(case: Case, config: Config) -> tuple[Reconstructor, Grid]:
-    """The reconstructor of a case, and the pixels of its frames."""
+def build_solver(case: Case, config: Config) -> tuple[Reconstructor, SensorGeometry]:
+    """The reconstructor of a case, and what it knows of the sensor."""
     simulator = ExposureSimulator.build(config)
     geometry, settings = geometry_of(config, simulator), config.estimation
     if case.strength == "known":
         settings = settings.model_copy(update={"seeing_arcsec": seeing_arcsec(simulator.air)})
     basis = None
     if settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes":
-        pupil = simulator.shape.on(geometry.frame)
-        basis = modal_basis(pupil, geometry.frame, diameter_m=geometry.pupil.diameter_m, count=settings.modes)
-    return build_reconstructor(geometry, settings, basis=basis), geometry.frame
+        basis = unwrapping_basis(geometry, simulator.shape.on(geometry.frame), modes=settings.modes)
+    return build_reconstructor(geometry, settings, basis=basis), geometry
 
 
 def run_case(case: Case, config: Config, capture: Capture, light: Light, progress: Progress) -> Row:
     """Reconstruct all the screens of a case and sum up."""
-    solver, frame = build_solver(case, config)
+    solver, geometry = build_solver(case, config)
     read_variance = Detector(config.detector).variance_without_light
     modes = ModeErrors.of(solver) if isinstance(solver, MaximumAPosteriori) else None
 
@@ -89,15 +92,17 @@ def run_case(case: Case, config: Config, capture: Capture, light: Light, progres
         begun_s = time.perf_counter()
         found = jax.block_until_ready(reconstruct(solver, counts))
         milliseconds = 1e3 * (time.perf_counter() - begun_s)
-        scored.append(_scored(found, screen, light, frame, modes)._replace(milliseconds=milliseconds))
+        scored.append(_scored(found, screen, light, geometry, modes)._replace(milliseconds=milliseconds))
         progress(case.name, number + 1, len(light.screens))
     return _summed_up(scored, capture) | _sky_columns(case, config, [one.strength for one in scored])
 
 
-def _scored(found: WavefrontEstimate, screen: Screen, light: Light, frame: Grid, modes: ModeErrors | None) -> Scored:
+def _scored(
+    found: WavefrontEstimate, screen: Screen, light: Light, geometry: SensorGeometry, modes: ModeErrors | None
+) -> Scored:
     """Compare an estimate with the truth; an error that is not finite counts as `LOST_NM`."""
     opd_m = np.asarray(found.opd_m, float)
-    fine_m = wavefront_error_m(opd_m, frame, screen.truth_m, light.weights, light.grid)
+    fine_m = wavefront_error_m(opd_m, geometry.frame, screen.truth_m, light.weights, light.grid)
     error_m = opd_m - screen.pixels_m
     whole = bool(np.isfinite(opd_m).all())
     groups = dict.fromkeys(GROUPS_CPA, math.nan)
@@ -113,6 +118,7 @@ def _scored(found: WavefrontEstimate, screen: Screen, light: Light, frame: Grid,
         strength=float(found.strength),
         milliseconds=math.nan,
         groups=groups,
+        steps=step_errors(error_m, light.segments, wavelength_m=geometry.wavelength_m),
     )
 
 
@@ -121,6 +127,8 @@ def _summed_up(scored: list[Scored], capture: Capture) -> Row:
     fine_nm, pixels_nm = (np.array([getattr(one, name) for one in scored]) for name in ("fine_nm", "pixels_nm"))
     captured = fine_nm < capture.captured_nm
     right = captured if capture.score == "fine" else pixels_nm < capture.captured_nm
+    if capture.score == "segments":
+        right = steps_captured([one.steps for one in scored], capture.captured_nm)
     believed = np.array([one.outcome.succeeded for one in scored])
     ffts = [one.ffts for one in scored]
     among = float(np.median(fine_nm[captured])) if captured.any() else math.nan
@@ -140,6 +148,7 @@ def _summed_up(scored: list[Scored], capture: Capture) -> Row:
         "believed_wrong": float(np.mean(believed & ~right)),
         "doubted_right": float(np.mean(~believed & right)),
         **_over_predicted([one for one in scored if one.outcome.succeeded]),
+        **step_columns([one.steps for one in scored], capture.captured_nm),
     }
 
 

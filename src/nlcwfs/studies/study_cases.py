@@ -17,11 +17,11 @@ class Capture(NamedTuple):
     Attributes:
         captured_nm: Its error is below this.
         score: Which error judges what is believed: on the grid of the light (`fine`), or of the mean over every
-            detector pixel (`pixels`).
+            detector pixel (`pixels`); or of the pistons of segments modulo the wavelength (`segments`).
     """
 
     captured_nm: float
-    score: Literal["fine", "pixels"] = "fine"
+    score: Literal["fine", "pixels", "segments"] = "fine"
 
 
 class Case(BaseModel):
@@ -72,10 +72,10 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
-    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration"], ...] = ()
+    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments"], ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
-    score: Literal["fine", "pixels"] = "fine"
+    score: Literal["fine", "pixels", "segments"] = "fine"
     set: tuple[str, ...] = ()
     case: tuple[Case, ...]
 

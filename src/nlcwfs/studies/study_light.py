@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
@@ -16,6 +16,7 @@ from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
+from nlcwfs.simulation.segment_score import segment_pixels
 from nlcwfs.simulation.static_aberration import lit_part
 from nlcwfs.studies.study_cases import Case
 
@@ -45,12 +46,14 @@ class Light(NamedTuple):
         grid: Grid of the truth.
         weights: Share of the light in its cells.
         pixel_weights: Share of the light on the detector's pixels.
+        segments: Segment of every pixel and the light that it has of that segment alone; None for one piece.
     """
 
     screens: list[Screen]
     grid: Grid
     weights: Float[np.ndarray, "Y X"]
     pixel_weights: Float[np.ndarray, "y x"]
+    segments: tuple[Int[np.ndarray, "y x"], Float[np.ndarray, "y x"]] | None = None
 
     def first(self, count: int) -> "Light":
         """The same light, fewer screens."""
@@ -80,7 +83,7 @@ def make_light(case: Case, config: Config, count: int, progress: Progress) -> Li
         shares = light_weights(np.asarray(matched.pupil))
         return Light(screens, simulator.frame, shares, shares)
     shares = integrate_on_pixels(simulator.weights[None], factor=simulator.factor, window=simulator.window)[0]
-    return Light(screens, grid, weights, np.asarray(shares, float))
+    return Light(screens, grid, weights, np.asarray(shares, float), segment_pixels(simulator))
 
 
 def matched_model(config: Config, simulator: ExposureSimulator) -> CurvatureSensor:

@@ -53,8 +53,30 @@ COLUMNS: dict[str, dict[str, Column]] = {
         "bound [nm]": ("bound_pixels_nm", "{:.1f}"),
         "quantum limit [nm]": ("quantum_pixels_nm", "{:.1f}"),
     },
+    "segments": SKY
+    | {
+        "screens": ("screens", "{}"),
+        "piston [nm]": ("piston_modulo_nm", "{:.2f}"),
+        "worst": ("piston_modulo_worst_nm", "{:.1f}"),
+        "inside [nm]": ("inside_nm", "{:.1f}"),
+        "worst inside": ("inside_worst_nm", "{:.1f}"),
+        "straightened [nm]": ("straightened_nm", "{:.1f}"),
+        "captured": ("captured_steps", "{:.0%}"),
+        "right turns": ("right_turns", "{:.0%}"),
+        "FFTs": ("ffts", "{:.0f}"),
+        "ms": ("ms_per_frame", "{:.0f}"),
+        "believed wrong": ("believed_wrong", "{:.0%}"),
+        "doubted right": ("doubted_right", "{:.0%}"),
+    },
 }
 """Columns of the page, by title, for each score of `Capture`."""
+
+QUICK = {
+    "fine": ("captured", "median_nm"),
+    "pixels": ("captured_pixels", "median_pixels_nm"),
+    "segments": ("captured_steps", "piston_modulo_nm"),
+}
+"""What a quick look tells, for each score."""
 
 
 def write_report(folder: Path, study: Study, table: StudyTable, pictures: dict[str, str]) -> Path:
@@ -81,7 +103,7 @@ def write_report(folder: Path, study: Study, table: StudyTable, pictures: dict[s
 
 def quick_lines(study: Study, table: StudyTable, only: tuple[str, ...]) -> list[str]:
     """What a quick look found: a line for each case, in the order of the study."""
-    captured, error = ("captured", "median_nm") if study.score == "fine" else ("captured_pixels", "median_pixels_nm")
+    captured, error = QUICK[study.score]
     rows = {str(row["case"]): row for row in table.rows}
     names = [case.name for case in study.case if case.name in rows and (not only or case.name.startswith(only))]
     return [
