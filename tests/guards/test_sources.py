@@ -21,7 +21,7 @@ LONG_FUNCTIONS = {
     "estimation/ladder.py:_level": "one call that fills the sixteen fields of a level",
 }
 MANY_PARAMETERS = {
-    "curvature_sensor/defocused_images.py:build": "the seven things a sensor is made of, four of them optional",
+    "curvature_sensor/defocused_images.py:build": "the eight things a sensor is made of, five of them optional",
     "estimation/amplitude_constraint.py:modulus_factor": "noise, doubt and a mean known already are options",
     "estimation/ladder.py:_level": "fills a record; private",
     "estimation/gerchberg_saxton.py:problem_at": "fills a record",

@@ -8,7 +8,7 @@ from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
 from nlcwfs.beam.colour_sampling import ColouredImage, sampling_error, wavelengths_needed
 from nlcwfs.beam.fresnel import fresnel_transfer
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.light_band import Band
+from nlcwfs.beam.light_band import LightBand
 from nlcwfs.beam.pupil import circular_pupil
 
 DIAMETER_M, WAVELENGTH_M, CELLS = 2.0, 0.85e-6, 48
@@ -55,7 +55,7 @@ def test_the_error_of_few_wavelengths_is_what_coherence_says_or_less(law, rms_nm
     A factor f in the phase of pairs is f^(2 n) in the error of n of Gauss's nodes.
     """
     air = Turbulence.from_rms(opd_rms_m=rms_nm * 1e-9, diameter_m=DIAMETER_M)
-    distance_m, band = law(150e3), Band.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
+    distance_m, band = law(150e3), LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
     image = ColouredImage(DIAMETER_M, distance_m, air.structure_m2)
     for count in (1, 2, 3):
         predicted = sampling_error(image, band, band.spectrum(count))
@@ -67,14 +67,14 @@ def test_the_error_of_few_wavelengths_is_what_coherence_says_or_less(law, rms_nm
 
 def test_gauss_needs_fewer_wavelengths_than_equal_steps_where_lenses_are_chromatic():
     air = Turbulence.from_rms(opd_rms_m=700e-9, diameter_m=DIAMETER_M)
-    band = Band.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
+    band = LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
     gauss, steps = (measured_error(air, inverse(150e3), band, rule(5)) for rule in (band.spectrum, band.equal_steps))
     assert gauss < steps / 20  # exponential against second order
 
 
 def test_a_common_tilt_needs_no_more_wavelengths():
     """Achromatic lenses move all colours of a tilted wavefront alike; its structure function is (slope s)^2."""
-    band = Band.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.2 * WAVELENGTH_M)
+    band = LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.2 * WAVELENGTH_M)
     tilted = ColouredImage(DIAMETER_M, constant(150e3), lambda apart_m: (1e-6 * apart_m) ** 2)
     coherence = tilted.speckle_coherence(band.spectrum(4).wavelengths_m)
     np.testing.assert_allclose(coherence, 1, atol=1e-9)  # V cancels to rounding of (k slope D)^2 = 200

@@ -194,3 +194,75 @@ def test_the_visibility_of_a_disc_is_that_of_the_textbook():
     assert visibility[4, 0] > 0.5 > 0 > visibility[10, 0]
     gaussian = ApparentStar(size_rad=size_rad, profile="gaussian").visibility(grid, distance_m=-distance_m)
     assert gaussian[8, 0] == pytest.approx(np.exp(-((np.pi * 1.21967) ** 2) / (4 * np.log(2))), rel=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------- budgets
+
+WIDE = Grid((64, 63), 0.125)  # 8 m high, lit everywhere: waves come back on the other side as they would without a rim
+RIPPLE_CPA, RIPPLE_M, PLANE_M = 16, 1e-9, 3.5e6
+
+
+def amplitude_of_a_ripple(colours: Spectrum, star: ApparentStar, law: LensLaw) -> complex:
+    """What a ripple of 16 cycles along y and 1 nm becomes in an image, over the mean light."""
+    opd_m = RIPPLE_M * np.cos(2 * np.pi * RIPPLE_CPA * WIDE.y_m / 8.0) + 0 * WIDE.x_m
+    rows = law.distances_m((PLANE_M,), colours.wavelengths_m)
+    image = images_of(opd_m, rows, colours, grid=WIDE, pupil=np.ones(WIDE.shape), star=star)[0]
+    wave = np.exp(-2j * np.pi * RIPPLE_CPA * WIDE.y_m / 8.0)
+    return complex(2 * np.mean(image * wave) / np.mean(image))
+
+
+def ripple_budget(colours: Spectrum, fades, law: LensLaw) -> complex:
+    """Sum over colours of 2 k h sin(pi lambda z f^2), each with its factor (docs/colour.md)."""
+    total = 0.0
+    for (wavelength_m, share), fade in zip(zip(colours.wavelengths_m, colours.shares, strict=True), fades, strict=True):
+        z_m = float(law.distances_m((PLANE_M,), (wavelength_m,))[0, 0])
+        signal = np.sin(np.pi * wavelength_m * z_m * (RIPPLE_CPA / 8.0) ** 2)
+        total += share * 2 * (2 * np.pi / wavelength_m) * RIPPLE_M * signal * fade(z_m * RIPPLE_CPA / 8.0)
+    return total
+
+
+@pytest.mark.parametrize("kind", ["achromatic", "ideal"])
+def test_a_star_of_some_size_fades_a_ripple_by_its_visibility(kind):
+    """A disc of 20 mas at z f = 7e6 cycles per radian: 2 J1(x) / x with x = pi size z f, about 0.48."""
+    size_rad, law = 20e-3 * np.pi / 180 / 3600, LensLaw(kind, 0.85e-6)
+
+    def disc(cycles_per_rad):
+        x = np.linspace(-1, 1, 20001)[1:-1]  # the strips of a disc, summed: no Bessel function
+        return np.average(np.cos(np.pi * size_rad * cycles_per_rad * x), weights=np.sqrt(1 - x**2))
+
+    found = amplitude_of_a_ripple(RAINBOW, ApparentStar(size_rad=size_rad), law)
+    expected = ripple_budget(RAINBOW, [disc] * 3, law)
+    point = ripple_budget(RAINBOW, [lambda cycles_per_rad: 1.0] * 3, law)
+    assert abs(expected) < 0.7 * abs(point)
+    # Second order in the ripple's phase of 0.01 rad: 1e-4; its square is at twice the frequency.
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_colours_from_aside_add_their_ripples_with_their_phases():
+    """What dispersion leaves: each colour's wave is turned by 2 pi z f theta."""
+    law, angles_rad = LensLaw("ideal", 0.85e-6), (2e-8, 0.0, -1.5e-8)
+
+    def turned(angle_rad):
+        return lambda cycles_per_rad: np.exp(-2j * np.pi * angle_rad * cycles_per_rad)
+
+    star = ApparentStar(
+        tuple((angle_rad, 3e-8) for angle_rad in angles_rad)
+    )  # x moves nothing: the ripple runs along y
+    found = amplitude_of_a_ripple(RAINBOW, star, law)
+    expected = ripple_budget(RAINBOW, [turned(angle_rad) for angle_rad in angles_rad], law)
+    assert found == pytest.approx(expected, rel=1e-3)
+    assert abs(expected.imag) > 0.1 * abs(expected)  # a sign of z or theta would show
+
+
+def test_the_fading_by_dispersion_is_that_of_the_variance_of_the_tilt():
+    """For small tilts exp(-2 (pi z f)^2 variance), the budget of docs/colour.md."""
+    law, angles_rad = LensLaw("ideal", 0.85e-6), np.array([1e-8, 0.0, -0.8e-8])
+    phases = Spectrum((0.85e-6, 0.8500001e-6, 0.8499999e-6), RAINBOW.shares)  # one colour, three directions
+    star = ApparentStar(tuple((angle_rad, 0.0) for angle_rad in angles_rad))
+    left = abs(amplitude_of_a_ripple(phases, star, law)) / abs(amplitude_of_a_ripple(phases, ApparentStar(), law))
+    shares = np.array(RAINBOW.shares)
+    variance = shares @ angles_rad**2 - (shares @ angles_rad) ** 2
+    assert left == pytest.approx(
+        np.exp(-2 * (np.pi * PLANE_M * RIPPLE_CPA / 8.0) ** 2 * variance), rel=2e-3
+    )  # 4th order
+    assert left < 0.98

@@ -43,6 +43,22 @@ def test_dispersion_is_ciddors():
     )  # Edlen and Barrell & Sears part at 0.4 um
 
 
+@pytest.mark.parametrize(("pressure_hpa", "temperature_k"), [(616.0, 273.15), (1013.25, 288.15)])
+def test_towards_the_horizon_the_curvature_of_the_air_counts(pressure_hpa, temperature_k):
+    """dR/dn = (1 - b) tan Z - (b - (n - 1)) tan^3 Z, b the height of the air over the Earth's radius (Stone 1996)."""
+    site, height = Site(pressure_hpa, temperature_k, 0.3), 0.001254 * temperature_k / 273.15
+    thin = 287e-6 * pressure_hpa / 1013.25 * 273.15 / temperature_k  # n - 1 near 1 um
+
+    def expected(zenith_deg):
+        tangent = np.tan(np.radians(zenith_deg))
+        return (1 - height) * tangent - (height - thin) * tangent**3
+
+    def found(zenith_deg):
+        return np.diff(site.refraction_rad(np.array([0.7, 1.0]), zenith_deg=zenith_deg))[0]
+
+    assert found(75.0) / found(30.0) == pytest.approx(expected(75.0) / expected(30.0), rel=2e-3)  # the cube is 1.5e-2
+
+
 SETTINGS = {"zenith_deg": 45.0, "pressure_hpa": 616.0, "temperature_k": 273.15, "humidity_ratio": 0.3}
 COLOURS_M = (0.5e-6, 0.7e-6, 0.85e-6, 1.0e-6)
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.integrate
 from astropy.table import Table
 
-from nlcwfs.beam.light_band import Band, read_spectrum_table
+from nlcwfs.beam.light_band import LightBand, read_spectrum_table
 from nlcwfs.errors import FileFormatError, SettingsError
 
 RED = {"wavelength_m": 0.85e-6, "bandwidth_m": 0.34e-6}
@@ -19,7 +19,7 @@ def planck_photons(wavelength_m, temperature_k):
 @pytest.mark.parametrize("count", [1, 2, 5, 16, 64])
 def test_flat_light_is_sampled_by_gauss_and_legendre(count):
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    spectrum = Band.flat(**RED).spectrum(count)
+    spectrum = LightBand.flat(**RED).spectrum(count)
     np.testing.assert_allclose(spectrum.wavelengths_m, 0.85e-6 + 0.17e-6 * nodes, rtol=1e-13)  # rounding
     np.testing.assert_allclose(spectrum.shares, weights / 2, rtol=1e-10)  # eigenvectors of a 64 x 64 matrix
 
@@ -35,21 +35,21 @@ def test_a_black_body_has_the_means_of_its_photons(temperature_k, power):
         )[0]
 
     expected = mean_of(lambda x: x**power) / mean_of(lambda x: 1.0)
-    spectrum = Band.black_body(**RED, temperature_k=temperature_k).spectrum(12)
+    spectrum = LightBand.black_body(**RED, temperature_k=temperature_k).spectrum(12)
     means = np.sum(np.array(spectrum.shares) * (np.array(spectrum.wavelengths_m) * 1e6) ** power)
     assert means == pytest.approx(expected, rel=1e-8)  # 1/x is no polynomial: 12 nodes leave 1e-17, the constants 1e-9
 
 
 def test_a_very_cold_star_still_has_light():
     """Its exponentials are below the smallest number; it sends all its photons at the red end."""
-    spectrum = Band.black_body(**RED, temperature_k=1.0).spectrum(3)
+    spectrum = LightBand.black_body(**RED, temperature_k=1.0).spectrum(3)
     assert sum(spectrum.shares) == pytest.approx(1, abs=1e-12)
     assert min(spectrum.wavelengths_m) > 1.015e-6
 
 
 def test_a_table_is_linear_between_its_rows():
     wavelengths_um, photons = np.array([0.6, 0.7, 0.85, 0.9]), np.array([0.0, 3.0, 1.0, 2.0])
-    spectrum = Band.tabulated(wavelengths_um * 1e-6, photons).spectrum(4)
+    spectrum = LightBand.tabulated(wavelengths_um * 1e-6, photons).spectrum(4)
     x = np.linspace(0.6, 0.9, 300_001)
     light = np.interp(x, wavelengths_um, photons)
     for power in range(8):  # four of Gauss's nodes are exact up to degree 7
@@ -60,7 +60,7 @@ def test_a_table_is_linear_between_its_rows():
 
 def test_two_bands_get_their_own_wavelengths():
     rows_um = np.array([0.5, 0.6, 0.6001, 0.7999, 0.8, 0.9])
-    band = Band.tabulated(rows_um * 1e-6, np.array([1.0, 1.0, 0.0, 0.0, 1.0, 1.0]))
+    band = LightBand.tabulated(rows_um * 1e-6, np.array([1.0, 1.0, 0.0, 0.0, 1.0, 1.0]))
     spectrum = band.spectrum(6)
     blue = np.array(spectrum.wavelengths_m) < 0.7e-6
     assert blue.sum() == 3
@@ -69,7 +69,7 @@ def test_two_bands_get_their_own_wavelengths():
 
 
 def test_equal_steps_have_the_light_of_their_steps():
-    spectrum = Band.tabulated(np.array([0.6e-6, 0.8e-6]), np.array([0.0, 1.0])).equal_steps(4)
+    spectrum = LightBand.tabulated(np.array([0.6e-6, 0.8e-6]), np.array([0.0, 1.0])).equal_steps(4)
     np.testing.assert_allclose(spectrum.wavelengths_m, [0.625e-6, 0.675e-6, 0.725e-6, 0.775e-6], rtol=1e-2)
     # A triangle: 1, 3, 5, 7 sixteenths; 16 points tell its integral to some 0.003.
     np.testing.assert_allclose(spectrum.shares, np.array([1, 3, 5, 7]) / 16, atol=0.01)
@@ -78,13 +78,13 @@ def test_equal_steps_have_the_light_of_their_steps():
 @pytest.mark.parametrize("count", [0, 129])
 def test_a_number_of_wavelengths_that_cannot_be_is_refused(count):
     with pytest.raises(SettingsError, match=f"beam.spectrum.wavelengths: must be from 1 to 128, got {count}"):
-        Band.flat(**RED).spectrum(count)
+        LightBand.flat(**RED).spectrum(count)
 
 
 @pytest.mark.parametrize("bandwidth_m", [0.0, -1e-7, 1.7e-6, np.nan])
 def test_a_band_down_to_no_wavelength_is_refused(bandwidth_m):
     with pytest.raises(SettingsError, match=r"^beam\.spectrum\.bandwidth_um: must be positive and less than 1.7"):
-        Band.flat(wavelength_m=0.85e-6, bandwidth_m=bandwidth_m)
+        LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=bandwidth_m)
 
 
 # ------------------------------------------------------------------------------------------------- tables

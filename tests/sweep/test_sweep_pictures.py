@@ -122,8 +122,8 @@ def test_cases_show_every_loop_and_how_many_closed(tmp_path):
     figure = draw_cases(tmp_path, rows)
     assert figure is not None
     closed, lost, floor = figure.axes[0].get_lines()
-    assert closed.get_ydata().tolist() == [80, 81]
-    assert lost.get_ydata().tolist() == [900]
-    assert set(floor.get_ydata()) == {70}
-    labels = [tick.get_text() for tick in figure.axes[0].get_xticklabels()]
-    assert labels == ["a\n2 of 3 closed", "b\n0 of 1 closed"]
+    assert closed.get_xdata().tolist() == [80, 81]
+    assert lost.get_xdata().tolist() == [900]
+    assert set(floor.get_xdata()) == {70}
+    labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels()]
+    assert labels == ["a, 2 of 3 closed", "b, 0 of 1 closed"]

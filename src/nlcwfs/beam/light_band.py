@@ -26,7 +26,7 @@ NODES_OF_A_PIECE = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Band:
+class LightBand:
     """Light over a range of wavelengths, as points so dense that nothing is lost.
 
     Attributes:
@@ -35,7 +35,7 @@ class Band:
         ends_m: The shortest and the longest wavelength at which there is light.
 
     Examples:
-        >>> band = Band.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
+        >>> band = LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
         >>> [round(1e6 * one, 3) for one in band.spectrum(3).wavelengths_m]
         [0.718, 0.85, 0.982]
     """
@@ -45,7 +45,7 @@ class Band:
     ends_m: tuple[float, float]
 
     @classmethod
-    def flat(cls, *, wavelength_m: float, bandwidth_m: float) -> "Band":
+    def flat(cls, *, wavelength_m: float, bandwidth_m: float) -> "LightBand":
         """As many photons at every wavelength of a band.
 
         Raises:
@@ -55,14 +55,14 @@ class Band:
         return _from_pieces(np.array([low_m, high_m]), np.ones(2), SMOOTH_NODES)
 
     @classmethod
-    def black_body(cls, *, wavelength_m: float, bandwidth_m: float, temperature_k: float) -> "Band":
+    def black_body(cls, *, wavelength_m: float, bandwidth_m: float, temperature_k: float) -> "LightBand":
         r"""The photons of a black body through a band: :math:`\lambda^{-4} / (\exp(hc / \lambda k T) - 1)` (Planck).
 
         Raises:
             SettingsError: If a length or the temperature is not positive, or the band reaches down to 0.
 
         Examples:
-            >>> cool = Band.black_body(wavelength_m=0.85e-6, bandwidth_m=0.34e-6, temperature_k=3000.0)
+            >>> cool = LightBand.black_body(wavelength_m=0.85e-6, bandwidth_m=0.34e-6, temperature_k=3000.0)
             >>> bool(cool.shares @ cool.wavelengths_m > 0.855e-6)
             True
         """
@@ -78,14 +78,15 @@ class Band:
         return cls(flat.wavelengths_m, photons / photons.sum(), flat.ends_m)
 
     @classmethod
-    def tabulated(cls, wavelengths_m: Float[np.ndarray, " row"], photons: Float[np.ndarray, " row"]) -> "Band":
+    def tabulated(cls, wavelengths_m: Float[np.ndarray, " row"], photons: Float[np.ndarray, " row"]) -> "LightBand":
         """Photons per wavelength at some wavelengths, linear between them and none beyond.
 
         Raises:
             SettingsError: If there are fewer than two rows, wavelengths do not ascend, or photons are negative or none.
 
         Examples:
-            >>> two = Band.tabulated(np.array([0.5, 0.6, 0.61, 0.79, 0.8, 0.9]) * 1e-6, np.array([1, 1, 0, 0, 1, 1.0]))
+            >>> rows_um, photons = np.array([0.5, 0.6, 0.61, 0.79, 0.8, 0.9]), np.array([1, 1, 0, 0, 1, 1.0])
+            >>> two = LightBand.tabulated(1e-6 * rows_um, photons)
             >>> [round(share, 2) for share in two.spectrum(2).shares]
             [0.5, 0.5]
         """
@@ -136,7 +137,7 @@ class Band:
         """The middles of equal steps in wavelength: what one would do without thinking; to compare.
 
         Examples:
-            >>> band = Band.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
+            >>> band = LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
             >>> [round(1e6 * one, 3) for one in band.equal_steps(2).wavelengths_m]
             [0.765, 0.935]
         """
@@ -148,7 +149,7 @@ class Band:
         return Spectrum(tuple((edges_m[1:] + edges_m[:-1]) / 2), tuple(shares / shares.sum()))
 
 
-def read_spectrum_table(path: Path | str) -> Band:
+def read_spectrum_table(path: Path | str) -> LightBand:
     r"""Read a text table of two columns, wavelength [um, or its unit] and photons per wavelength (ECSV, CSV).
 
     Args:
@@ -156,7 +157,7 @@ def read_spectrum_table(path: Path | str) -> Band:
 
     Raises:
         FileFormatError: If the file cannot be read, or has not two columns of numbers.
-        SettingsError: If its numbers break a rule of `Band.tabulated`.
+        SettingsError: If its numbers break a rule of `LightBand.tabulated`.
 
     Examples:
         >>> import tempfile
@@ -184,7 +185,7 @@ def read_spectrum_table(path: Path | str) -> Band:
     except Exception as error:  # astropy has many of its own, and a sentence in each
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise FileFormatError(f"{path}: must be a table of two columns of numbers, got: {reason[0][:100]}") from None
-    return Band.tabulated(wavelengths_m, photons)
+    return LightBand.tabulated(wavelengths_m, photons)
 
 
 def _ends(wavelength_m: float, bandwidth_m: float) -> tuple[float, float]:
@@ -196,7 +197,7 @@ def _ends(wavelength_m: float, bandwidth_m: float) -> tuple[float, float]:
     return wavelength_m - bandwidth_m / 2, wavelength_m + bandwidth_m / 2
 
 
-def _from_pieces(edges_m: Float[np.ndarray, " row"], photons: Float[np.ndarray, " row"], points: int) -> Band:
+def _from_pieces(edges_m: Float[np.ndarray, " row"], photons: Float[np.ndarray, " row"], points: int) -> LightBand:
     """Points of Gauss and Legendre in every piece, weighted by light that is linear in it."""
     nodes, weights = np.polynomial.legendre.leggauss(points)
     along = (nodes + 1) / 2
@@ -205,7 +206,7 @@ def _from_pieces(edges_m: Float[np.ndarray, " row"], photons: Float[np.ndarray, 
     light = (photons[:-1, None] * (1 - along) + photons[1:, None] * along) * weights * wide_m
     lit = np.flatnonzero(light.any(axis=1))
     ends_m = float(edges_m[lit[0]]), float(edges_m[lit[-1] + 1])
-    return Band(wavelengths_m.ravel(), (light / light.sum()).ravel(), ends_m)
+    return LightBand(wavelengths_m.ravel(), (light / light.sum()).ravel(), ends_m)
 
 
 def _few(values: Float[np.ndarray, " row"]) -> str:

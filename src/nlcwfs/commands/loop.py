@@ -25,6 +25,7 @@ from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
 from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
 from nlcwfs.simulation.closed_loop.run import run_loop, summary
+from nlcwfs.simulation.colours import colour_account
 
 CHECKPOINT_EVERY_S = 20.0
 """Time between two checkpoints, in seconds of the computation."""
@@ -46,6 +47,8 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
     stopped = folder_of.read_checkpoint(out, config) if resume else None
     say("Making the air, the mirror and the reconstructor ...", quiet=quiet)
     running = Loop.build(config)
+    for line in colour_account(config, running.light.still.air):
+        say(line, quiet=quiet)
     state, records = stopped or (None, None)
     if records:
         say(f"Going on at frame {len(records)} of {config.loop.frames}.", quiet=quiet)

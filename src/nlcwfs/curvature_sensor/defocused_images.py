@@ -112,7 +112,7 @@ class CurvatureSensor(eqx.Module):
         static = np.zeros_like(pupil, float) if static_opd_m is None else static_opd_m
         return cls(
             pupil=jnp.asarray(centred_in(pupil, grid.shape), dtype),
-            transfer=jnp.asarray(_transfer(grid, distances, spectrum, star), np.result_type(dtype, np.complex64)),
+            transfer=jnp.asarray(_transfer(grid, distances, spectrum, star=star, dtype=dtype)),
             visibility=None if star.size_rad == 0 else jnp.asarray(_visibility(grid, distances, star), dtype),
             flux_fractions=jnp.asarray(fractions, dtype),
             static_opd_m=jnp.asarray(centred_in(static, grid.shape), dtype),
@@ -171,7 +171,7 @@ def _by_colour(
 
 
 def _transfer(
-    grid: Grid, distances: Float[np.ndarray, "colour plane"], spectrum: Spectrum, star: ApparentStar
+    grid: Grid, distances: Float[np.ndarray, "colour plane"], spectrum: Spectrum, *, star: ApparentStar, dtype: str
 ) -> Complex[np.ndarray, "shared plane y x"]:
     """Fresnel factors; one for all colours if wavelength times distance and the direction are the same."""
     colours = np.array(spectrum.wavelengths_m)
@@ -180,15 +180,16 @@ def _transfer(
         rule = f"must be one for each of {len(colours)} colours"
         raise SettingsError("curvature_sensor.star", rule, f"{len(star.directions_rad)} directions")
     alike = not star.is_bent and bool(np.all(np.abs(reach - reach[0]) <= 1e-15 * np.abs(reach[0])))
-    factors = []
-    for number, wavelength_m in enumerate(colours[:1] if alike else colours):
-        scale = {"wavelength_m": float(wavelength_m), "pixel_m": grid.pixel_m}
-        planes = [fresnel_transfer(grid.shape, distance_m=float(z_m), **scale) for z_m in distances[number]]
-        if star.is_bent:
-            moves = [star.shift(grid, distance_m=float(z_m), colour=number) for z_m in distances[number]]
-            planes = [plane * move for plane, move in zip(planes, moves, strict=True)]
-        factors.append(planes)
-    return np.array(factors)
+    shared = colours[:1] if alike else colours
+    kind = np.result_type(dtype, np.complex64)  # cast one by one: 37 colours of Table 1 are 1.2 GB
+    factors = np.empty((len(shared), distances.shape[1], *grid.shape), kind)
+    for number, plane in np.ndindex(factors.shape[:2]):
+        scale = {"wavelength_m": float(shared[number]), "pixel_m": grid.pixel_m}
+        distance_m = float(distances[number, plane])
+        factor = fresnel_transfer(grid.shape, distance_m=distance_m, **scale)
+        bent = star.shift(grid, distance_m=distance_m, colour=number) if star.is_bent else 1.0
+        factors[number, plane] = factor * bent
+    return factors
 
 
 def _visibility(

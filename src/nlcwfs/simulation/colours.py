@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.atmosphere.refraction import residual_dispersion_rad
 from nlcwfs.beam.colour_sampling import ColouredImage, sampling_error, wavelengths_needed
-from nlcwfs.beam.light_band import Band, read_spectrum_table
+from nlcwfs.beam.light_band import LightBand, read_spectrum_table
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD
@@ -40,7 +40,7 @@ class Colours:
     error: float
 
 
-def band_of(config: Config) -> Band | None:
+def band_of(config: Config) -> LightBand | None:
     """The light of a configuration; None for light of one wavelength.
 
     Raises:
@@ -63,9 +63,9 @@ def band_of(config: Config) -> Band | None:
         where = "beam.spectrum.bandwidth_um" if settings.bandwidth_um is not None else "beam.spectrum.bandwidth_ratio"
         width = {"bandwidth_m": settings.bandwidth_um_at(config.beam.wavelength_um) * 1e-6}
         if settings.shape == "flat":
-            band = Band.flat(wavelength_m=wavelength_m, **width)
+            band = LightBand.flat(wavelength_m=wavelength_m, **width)
         else:
-            band = Band.black_body(wavelength_m=wavelength_m, temperature_k=settings.temperature_k, **width)
+            band = LightBand.black_body(wavelength_m=wavelength_m, temperature_k=settings.temperature_k, **width)
     low_m, high_m = band.ends_m
     shown = f"{low_m * 1e6:.4g} to {high_m * 1e6:.4g} um"
     if high_m - low_m >= wavelength_m:

@@ -1,8 +1,8 @@
 """Figures of sweeps of the loop: what is left at each rate, of each star, in each case, and the star's image."""
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,9 +17,6 @@ RATE, MAGNITUDE = "loop.rate_hz", "atmosphere.star.magnitude"
 
 LEAST_RATES = 3
 """Fewer are no curve."""
-
-LONGEST_LABEL = 14
-"""Letters of a case's name in a line; it is broken at its hyphens."""
 
 
 def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
@@ -71,7 +68,7 @@ def at_best_rate(rows: Sequence[Row]) -> list[Row]:
 
 
 def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
-    """Residual of every loop, a column for each case; crosses are loops that closed and were open at their end.
+    """Residual of every loop, a line for each case; crosses are loops that closed and were open at their end.
 
     Args:
         folder: Of the sweep; nothing is read from it.
@@ -79,23 +76,22 @@ def draw_cases(folder: Path, rows: Sequence[Row]) -> Figure | None:
     """
     cases = _by_case(rows)
     names = list(cases)
-    figure = Figure(figsize=(8.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(8.2, 1.4 + 0.36 * len(names)), layout="constrained")
     axes = figure.subplots()
     ended = [row for row in rows if np.isfinite(float(row.get("rms_nm", np.nan)))]
     for marker, closed, label in (("o", True, "closed"), ("x", False, "closed and lost")):
         shown = [row for row in ended if (row["outcome"] == "closed") == closed]
         if not shown:
             continue
-        x = np.array([names.index(str(row["case"])) for row in shown]) + _side_by_side(shown)
-        axes.plot(x, column(shown, "rms_nm"), marker, color="C0" if closed else "C3", label=label)
+        y = np.array([names.index(str(row["case"])) for row in shown]) + _side_by_side(shown)
+        axes.plot(column(shown, "rms_nm"), y, marker, color="C0" if closed else "C3", label=label, markersize=5)
     for place, name in enumerate(names):
         floors = column([row for row in ended if row["case"] == name], "floor_nm")
         if len(floors):
-            axes.plot([place - 0.3, place + 0.3], [np.median(floors)] * 2, "--", color="0.4", linewidth=1)
-    axes.set_xlim(-0.5, len(names) - 0.5)
-    labels = [f"{textwrap.fill(name, LONGEST_LABEL)}\n{_closed_of(members)}" for name, members in cases.items()]
-    axes.set_xticks(range(len(names)), labels)
-    _residual_axis(axes)
+            axes.plot([np.median(floors)] * 2, [place - 0.3, place + 0.3], "--", color="0.4", linewidth=1)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_yticks(range(len(names)), [f"{name}, {_closed_of(members)}" for name, members in cases.items()])
+    _residual_axis(axes, along="x")
     axes.legend(fontsize=8, frameon=False)
     return figure
 
@@ -139,13 +135,12 @@ def _side_by_side(rows: Sequence[Row]) -> np.ndarray:
     return 0.08 * (seeds - np.mean(seeds))
 
 
-def _residual_axis(axes: Axes) -> None:
-    axes.set_ylabel("residual wavefront [nm rms]")
-    low, high = axes.get_ylim()
-    log_axis(
-        axes, [tick for tick in (20, 30, 40, 60, 80, 100, 120, 150, 200, 300, 500, 1000, 2000) if low < tick < high]
-    )
-    axes.set_ylim(low, high)
+def _residual_axis(axes: Axes, *, along: Literal["x", "y"] = "y") -> None:
+    (axes.set_xlabel if along == "x" else axes.set_ylabel)("residual wavefront [nm rms]")
+    low, high = axes.get_xlim() if along == "x" else axes.get_ylim()
+    ticks = [tick for tick in (20, 30, 40, 60, 80, 100, 120, 150, 200, 300, 500, 1000, 2000) if low < tick < high]
+    log_axis(axes, ticks, along=along)
+    (axes.set_xlim if along == "x" else axes.set_ylim)(low, high)
     axes.grid(alpha=0.3)
 
 
