@@ -42,6 +42,14 @@ class CurvatureSensorSettings(BaseModel):
         max_length=2,
         description="the glasses of a doublet, by their names in the catalogue of SCHOTT, silica or CaF2",
     )
+    membrane: Literal["none", "sine", "square"] = Field(
+        default="none",
+        description="a membrane that vibrates between the planes at +z and -z, in place of beam splitters: the "
+        "distances are the mean ones over half a period of a sine, or those where it rests",
+    )
+    membrane_dead_share: float = Field(
+        default=0.0, ge=0, lt=1, description="share of the time in which nothing is integrated, while it turns"
+    )
     static_rms_nm: float = Field(
         default=0.0, ge=0, description="rms of a known static Kolmogorov aberration in the arm of the sensor"
     )
@@ -60,6 +68,10 @@ class CurvatureSensorSettings(BaseModel):
             raise ValueError("defocus_waves must not be 0: an image in focus is at no distance")
         if all(place == 0 for place in places):
             raise ValueError("distances_km must hold a plane out of the pupil: one at 0 does not see the phase")
+        if self.membrane != "none" and sorted(places) != sorted(-place for place in places):
+            raise ValueError(f"{name} must be pairs with a membrane, one plane at +z for each at -z")
+        if self.membrane == "none" and self.membrane_dead_share:
+            raise ValueError("membrane_dead_share must be 0 without a membrane")
         if self.flux_fractions is None:
             return self
         if len(self.flux_fractions) != len(places):
@@ -75,4 +87,5 @@ class CurvatureSensorSettings(BaseModel):
         """Keep the fingerprint of settings as it was before there were these keys."""
         unused = {"defocus_waves": self.defocus_waves is None, "lenses": self.lenses == "achromatic"}
         unused["glasses"] = self.lenses != "doublet"
+        unused |= dict.fromkeys(("membrane", "membrane_dead_share"), self.membrane == "none")
         return {name: value for name, value in write(self).items() if not unused.get(name, False)}

@@ -1,5 +1,6 @@
 """Light of many colours on its way through one sensor: which wavelengths, which planes, from which directions."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.curvature_sensor.chromatic_lenses import LensLaw
+from nlcwfs.curvature_sensor.membrane import Moments, membrane_moments, moments_needed
 from nlcwfs.errors import SettingsError
 
 TILTED_TO_FLAT = math.sqrt(1.0299 / 0.134)
@@ -38,6 +40,16 @@ class Colours:
     star: ApparentStar
     law: LensLaw
     error: float
+
+    def in_motion(self, moments: Moments) -> "Colours":
+        """The same behind a membrane: each colour once for every moment."""
+        count, spectrum = len(moments.scales), self.spectrum
+        shares = tuple(colour * moment for colour in spectrum.shares for moment in moments.shares.tolist())
+        wavelengths_m = tuple(colour_m for colour_m in spectrum.wavelengths_m for _ in range(count))
+        moved = np.einsum("cp,m->cmp", self.distances_m, moments.scales).reshape(len(shares), -1)
+        directions = tuple(one for one in self.star.directions_rad for _ in range(count))
+        star = dataclasses.replace(self.star, directions_rad=directions)
+        return dataclasses.replace(self, spectrum=Spectrum(wavelengths_m, shares), distances_m=moved, star=star)
 
 
 def band_of(config: Config) -> LightBand | None:
@@ -115,14 +127,15 @@ def colours_of(config: Config, air: Turbulence) -> Colours:
     if band is None:
         one = Spectrum.monochromatic(wavelength_m)
         star = ApparentStar(**size) if size["size_rad"] else POINT
-        return Colours(one, law.distances_m(planes_m, one.wavelengths_m), star, law, 0.0)
+        return Colours(one, law.distances_m(planes_m, one.wavelengths_m), star, law, 0.0).in_motion(_moments(config))
     images = _images(config, air, law)
     count = config.beam.spectrum.wavelengths or wavelengths_needed(images, band)
     spectrum = band.spectrum(count)
     directions = _directions_rad(config, spectrum.wavelengths_m)
     error = max(sampling_error(image, band, spectrum) for image in images)
     star = ApparentStar(tuple(directions), **size)
-    return Colours(spectrum, law.distances_m(planes_m, spectrum.wavelengths_m), star, law, error)
+    places_m = law.distances_m(planes_m, spectrum.wavelengths_m)
+    return Colours(spectrum, places_m, star, law, error).in_motion(_moments(config))
 
 
 def colour_account(config: Config, air: Turbulence) -> list[str]:
@@ -135,7 +148,7 @@ def colour_account(config: Config, air: Turbulence) -> list[str]:
     lines, star = [], config.atmosphere.star
     if config.beam.spectrum.shape != "line":
         colours = colours_of(config, air)
-        band, count = band_of(config), len(colours.spectrum.shares)
+        band, count = band_of(config), len(set(colours.spectrum.wavelengths_m))
         low_m, high_m = colours.spectrum.wavelengths_m[:1] * 2 if band is None else band.ends_m
         enough = f"images right to {colours.error:.2g} of their fluctuations, about"
         lines.append(
@@ -149,6 +162,12 @@ def colour_account(config: Config, air: Turbulence) -> list[str]:
         if config.atmosphere.dispersion.zenith_deg:
             heights = [math.hypot(*one) / ARCSEC_RAD * 1e3 for one in colours.star.directions_rad]
             lines.append(f"Dispersion: colours come from up to {max(heights):.3g} mas beside the reference.")
+    sensor = config.curvature_sensor
+    if sensor.membrane != "none":
+        lost = f", {sensor.membrane_dead_share:.0%} of the light lost in its dead time" * (
+            sensor.membrane_dead_share > 0
+        )
+        lines.append(f"Membrane: {sensor.membrane}, {len(_moments(config).scales)} moments{lost}.")
     if star.size_mas:
         lines.append(f"Star: {star.profile} of {star.size_mas:g} mas.")
     return lines
@@ -171,6 +190,17 @@ def refuse_colours(config: Config, *, because: str) -> None:
         raise SettingsError("beam.spectrum.shape", f'must be "line" with {because}', f'"{config.beam.spectrum.shape}"')
     if config.atmosphere.star.size_mas:
         raise SettingsError("atmosphere.star.size_mas", f"must be 0 with {because}", config.atmosphere.star.size_mas)
+
+
+def _moments(config: Config) -> Moments:
+    """Of the membrane; at rest without one."""
+    settings, farthest_km = config.curvature_sensor, max(map(abs, config.curvature_sensor.distances_km))
+    count = moments_needed(
+        distance_m=farthest_km * 1e3,
+        wavelength_m=config.beam.wavelength_um * 1e-6,
+        finest_per_m=config.mirror.cutoff_cpa / config.beam.diameter_m,
+    )
+    return membrane_moments(settings.membrane, count=count, dead_share=settings.membrane_dead_share)
 
 
 def _of_doublet(law: LensLaw) -> tuple[tuple[float, ...], tuple[str, ...]]:

@@ -128,7 +128,7 @@ class ExposureSimulator(eqx.Module):
             weights=jnp.asarray(weights, dtype),
             detector=Detector(config.detector),
             wavelength_m=wavelength_m(config),
-            photons=config.atmosphere.photons,
+            photons=config.atmosphere.photons * (1 - config.curvature_sensor.membrane_dead_share),
             factor=config.simulation.light_oversampling,
             window=window,
             stand=SegmentAberrations.build(config.beam.segments, shape, light, pupil, dtype=dtype),

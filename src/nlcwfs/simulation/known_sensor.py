@@ -17,7 +17,9 @@ def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
     if count > 1 and config.beam.spectrum.shape != "line":
         spectrum = config.beam.spectrum.model_copy(update={"wavelengths": count})
         beam = config.beam.model_copy(update={"spectrum": spectrum})
-        colours = colours_of(config.model_copy(update={"beam": beam}), simulator.air)
+        still = {"membrane": "none", "membrane_dead_share": 0.0}  # the model's planes rest at their mean distances
+        planes = config.curvature_sensor.model_copy(update=still)
+        colours = colours_of(config.model_copy(update={"beam": beam, "curvature_sensor": planes}), simulator.air)
     return SensorGeometry(
         pupil=simulator.shape,
         frame=simulator.frame,
