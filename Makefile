@@ -46,6 +46,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs contrast studies/07-contrast/contrast.toml --out studies/07-contrast
 	$(BIN)/nlcwfs sweep studies/08-planes-and-pixels
 	$(BIN)/nlcwfs sensitivity studies/09-one-family
+	$(BIN)/nlcwfs sweep studies/10-colour-loop
 	$(BIN)/nlcwfs study studies/11-sparse-pupil
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 

@@ -18,6 +18,7 @@ STUDIES = (
     "07-contrast",
     "08-planes-and-pixels",
     "09-one-family",
+    "10-colour-loop",
     "11-sparse-pupil",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"

@@ -92,9 +92,3 @@ def test_colours_in_the_model_save_what_achromatic_lenses_cost(errors_nm):
     alone, together = np.array(errors_nm[1]), np.array(errors_nm[3])
     assert np.all(together < 0.8 * alone)
     assert 4 < np.median(together) < 12
-
-
-def test_each_colour_costs_as_many_ffts_as_the_first():
-    counts = jnp.asarray(exposed(0)[0], jnp.float32)
-    spent = [int(solver(one).estimate(counts, jnp.ones(counts.shape, bool)).ffts) for one in (None, BAND.spectrum(3))]
-    assert 2 < spent[1] / spent[0] < 3.2

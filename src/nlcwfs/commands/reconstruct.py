@@ -83,7 +83,7 @@ def reconstruct(config: Config, options: ReconstructOptions) -> Result:
     frames = read_frames(options.frames)
     work = prepared(config, options, frames)
     reconstructor = work.single if isinstance(work, SequenceRun) else work
-    for line in frame_warnings(frames):
+    for line in frame_warnings(frames, reconstructor.settings):
         warn(f"{options.frames}: {line}")
     settings = {"estimation": config.estimation.model_dump(mode="json"), "precision": config.precision}
     settings |= {"sequence": True} if options.sequence else {}

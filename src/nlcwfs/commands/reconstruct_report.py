@@ -20,11 +20,12 @@ FEW_FRAMES = 20
 """Up to here each frame gets a line, beyond only those that failed."""
 
 
-def frame_warnings(frames: FramesFile) -> list[str]:
+def frame_warnings(frames: FramesFile, settings: EstimationSettings) -> list[str]:
     """What the user should know about the frames before believing a wavefront."""
     found = list(frames.warnings)
-    if frames.bandwidth_m > 0:
-        found.append(f"BANDWID: {frames.bandwidth_m:g} m are treated as one colour, {frames.wavelength_m:g} m")
+    if frames.bandwidth_m > 0 and (settings.method != "map" or settings.map.wavelengths == 1):
+        told = f"BANDWID: {frames.bandwidth_m:g} m are treated as one colour, {frames.wavelength_m:g} m"
+        found.append(f"{told}; method map takes more, estimation.map.wavelengths")
     usable = [number for number in range(len(frames.electrons)) if number not in frames.frame_problems]
     found += step_warning(frames, float(np.median(frames.photo_electrons()[usable].sum(axis=(1, 2, 3)))))
     twin = twin_warning(frames)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.fit_quality import unexplained_share
-from nlcwfs.estimation.followed_air import FollowedAir
+from nlcwfs.estimation.followed_air import ExpectedAir, FollowedAir
 from nlcwfs.estimation.map_solution import Found, Task
 from nlcwfs.estimation.map_verdict import UNEXPLAINED
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
@@ -95,16 +95,14 @@ class SequenceReconstructor(eqx.Module):
         )
         solver = MaximumAPosteriori.build(geometry, settings, dtype=dtype)
         information = 4 * photons / (SENSOR_LOSS * float(jnp.sum(solver.level.light)))
-        air = FollowedAir.build(
-            solver.level.grid,
+        whole = ExpectedAir(
             solver.power,
             solver.tilt_rms_rad,
-            prior,
+            solver.level.grid,
             diameter_m=geometry.pupil.diameter_m,
             wavelength_m=geometry.wavelength_m,
-            interval_s=interval_s,
-            information=information,
         )
+        air = FollowedAir.build(whole, prior, interval_s=interval_s, information=information)
         return cls(solver=solver, air=air, inner=inner, interval_s=interval_s)
 
     @property

@@ -77,13 +77,13 @@ class SolvedPyramid(eqx.Module):
             known_rad: What is added to the air: minus the shape of a mirror.
             read_variance: Variance of a pixel without light, electrons squared.
         """
-        grid, dtype = self.air.grid, self.light.dtype
-        metres = self.air.wavelength_m / (2 * np.pi)
+        grid, dtype = self.air.whole.grid, self.light.dtype
+        metres = self.air.whole.wavelength_m / (2 * np.pi)
         # The tilt of the mirror goes to the tilt of the air, which no periodic window can hold.
         slope = -mean_slope(known_rad * metres, self.light, grid).astype(dtype)
         one = jnp.ones((), dtype)
         unseen = self.air.unseen(one, slope, PlaneScale(one, 0 * one))
-        total_rad = tilt_phase(slope, grid, self.air.wavelength_m) + known_rad
+        total_rad = tilt_phase(slope, grid, self.air.whole.wavelength_m) + known_rad
         problem = self._problem(counts, usable, total_rad, unseen, guess_rad, read_variance)
         unknown = self.air.prior(unseen).start(guess_rad - total_rad, noise_variance=1 / problem.information)
         state = gn.init(problem, unknown)
@@ -102,7 +102,9 @@ class SolvedPyramid(eqx.Module):
     ) -> Solved:
         """The wavefront of the next frame; arguments as for `start`."""
         expected = self.air.expected(memory)
-        total_rad = tilt_phase(memory.slope, self.air.grid, self.air.wavelength_m) + expected.phase_rad + known_rad
+        total_rad = (
+            tilt_phase(memory.slope, self.air.whole.grid, self.air.whole.wavelength_m) + expected.phase_rad + known_rad
+        )
         problem = self._problem(counts, usable, total_rad, expected, total_rad, read_variance)
         unknown = self.air.prior(expected).nothing()
         for inner in NEXT:
@@ -113,7 +115,7 @@ class SolvedPyramid(eqx.Module):
     def images(self, phase_rad: Float[Array, "Y X"]) -> Float[Array, "image v u"]:
         """Light of unit power at the pupil, on the pixels."""
         inner = self.optics.amplitude.shape
-        opd_m = cropped(phase_rad, (inner[0], inner[1])) * (self.air.wavelength_m / (2 * np.pi))
+        opd_m = cropped(phase_rad, (inner[0], inner[1])) * (self.air.whole.wavelength_m / (2 * np.pi))
         return self.optics.images(opd_m, 1.0).photons
 
     def _problem(

@@ -1,14 +1,17 @@
 """The sensor behind a file of frames: its geometry, the pixels that count, and the Zernikes these tell apart."""
 
+import dataclasses
 import math
 
 import numpy as np
 from jaxtyping import Float
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.light_band import LightBand
 from nlcwfs.beam.pupil import inside, light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.zernike import ZernikeFit, zernike_fit, zernikes
+from nlcwfs.curvature_sensor.chromatic_lenses import LensLaw
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.interop.frames_file import FramesFile
 
@@ -17,8 +20,13 @@ WELL_SEEN = 2.0
 tilt takes up noise from the last ones, because all are fitted together."""
 
 
-def sensor_geometry(frames: FramesFile) -> SensorGeometry:
-    """The sensor that a file of frames describes: one colour, no static aberration.
+def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1) -> SensorGeometry:
+    """The sensor that a file of frames describes, without a static aberration.
+
+    Args:
+        frames: The file.
+        wavelengths: By which a model stands for the light of its band, which is taken as flat in photons; 1 takes all
+            light for that of `WAVELEN`.
 
     Examples:
         >>> frames = FramesFile(
@@ -33,13 +41,20 @@ def sensor_geometry(frames: FramesFile) -> SensorGeometry:
         shape = PupilShape(frames.diameter_m, frames.obstruction_ratio, **maps)
     else:
         shape = PupilShape(frames.diameter_m, amplitude_map=frames.pupil, **maps)
-    return SensorGeometry(
+    geometry = SensorGeometry(
         pupil=shape,
         frame=Grid(frames.electrons.shape[2:], frames.pixel_m),
         wavelength_m=frames.wavelength_m,
         distances_m=frames.distances_m,
         flux_fractions=frames.flux_fractions,
     )
+    if wavelengths == 1 or frames.bandwidth_m == 0:
+        return geometry
+    band = LightBand.flat(wavelength_m=frames.wavelength_m, bandwidth_m=frames.bandwidth_m)
+    spectrum = band.spectrum(wavelengths)
+    law = LensLaw("ideal" if frames.chromatic_lenses else "achromatic", frames.wavelength_m)
+    places_m = law.distances_m(frames.distances_m, spectrum.wavelengths_m)
+    return dataclasses.replace(geometry, spectrum=spectrum, colour_distances_m=tuple(map(tuple, places_m.tolist())))
 
 
 def window_pupil(geometry: SensorGeometry, shape: tuple[int, int]) -> Float[np.ndarray, "y x"]:

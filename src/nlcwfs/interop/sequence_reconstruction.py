@@ -77,8 +77,9 @@ class SequenceRun(eqx.Module):
             raise SettingsError("--sequence", "must come with --method map", settings.method)
         usable = [number for number in range(len(frames.electrons)) if number not in frames.frame_problems]
         photons = max(float(np.median(frames.photo_electrons()[usable].sum(axis=(1, 2, 3)))), 1.0)
+        geometry = sensor_geometry(frames, wavelengths=settings.map.wavelengths)
         solver = SequenceReconstructor.build(
-            sensor_geometry(frames), settings, interval_s=times.interval_s, photons=photons, dtype=dtype
+            geometry, settings, interval_s=times.interval_s, photons=photons, dtype=dtype
         )
         single = FramesReconstructor.around(frames, settings, solver.solver, dtype=dtype)
         return cls(single=single, solver=solver, times=times)

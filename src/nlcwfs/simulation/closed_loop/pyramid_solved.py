@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
-from nlcwfs.estimation.followed_air import FollowedAir
+from nlcwfs.estimation.followed_air import ExpectedAir, FollowedAir
 from nlcwfs.estimation.ladder import window_shape
 from nlcwfs.estimation.maximum_a_posteriori import TILT_VARIANCE
 from nlcwfs.estimation.outcome import Outcome
@@ -99,16 +99,15 @@ class SearchingPyramid(eqx.Module):
         power = expected_power(grid, air, wavelength_m=wave_m, cutoff_per_m=None)
         tilt_rms_rad = math.sqrt(TILT_VARIANCE * (diameter_m / air.fried_at(wave_m)) ** (5 / 3))
         dtype = str(light.weights.dtype)
-        followed = FollowedAir.build(
-            grid,
+        whole = ExpectedAir(
             jnp.asarray(power, dtype),
             jnp.asarray(tilt_rms_rad, dtype),
-            settings.prior,
+            grid,
             diameter_m=diameter_m,
             wavelength_m=wave_m,
-            interval_s=1 / config.loop.rate_hz,
-            information=4 * still.photons / (SENSOR_LOSS * float(np.sum(weights))),
         )
+        information = 4 * still.photons / (SENSOR_LOSS * float(np.sum(weights)))
+        followed = FollowedAir.build(whole, settings.prior, interval_s=1 / config.loop.rate_hz, information=information)
         prism = pyramid_on(config, still, Grid((across[0], across[1]), grid.pixel_m))
         return cls(
             matrix=FollowedPyramid.build(config, light, optics),
@@ -165,11 +164,11 @@ class SearchingPyramid(eqx.Module):
         return {"read_variance": self.matrix.read_variance}
 
     def _phase(self, opd_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "Y X"]:
-        return self.on_model(opd_m) * (2 * np.pi / self.solver.air.wavelength_m)
+        return self.on_model(opd_m) * (2 * np.pi / self.solver.air.whole.wavelength_m)
 
     def _account(self, solved: Solved) -> tuple[Float[Array, " mode"], Float[Array, ""]]:
         """Commands of the residual, and the error that is expected of it."""
-        air, memory = self.solver.air, solved.memory
+        air, memory = self.solver.air.whole, solved.memory
         metres = air.wavelength_m / (2 * np.pi)
         factor = round(self.frame.pixel_m / air.grid.pixel_m)
         pixels = cropped(sum_blocks(solved.residual_rad[None], factor)[0] / factor**2, self.frame.shape)
