@@ -160,8 +160,9 @@ def _period(height_m: float, wavelength_m: float, side: int, pixel_m: float) -> 
     The finest wave of the grid sends light `wavelength height / (2 pixel)` aside.
     """
     reach_m = wavelength_m * height_m / (2 * pixel_m)
-    least = max(2 * side, side + 2 * math.ceil(reach_m / pixel_m))
-    period = least if least == 2 * side else int(scipy.fft.next_fast_len(least))
+    period = max(2 * side, side + 2 * math.ceil(reach_m / pixel_m))
+    while period > 2 * side and period != scipy.fft.next_fast_len(period):
+        period += 1
     if period > max(WIDEST_PERIOD, 2 * side):
         most_km = (WIDEST_PERIOD - side) * pixel_m**2 / wavelength_m / 1e3
         rule = f"must be at most {most_km:.3g} on cells of {pixel_m:.3g} m: light that the finest wave sends aside by "
