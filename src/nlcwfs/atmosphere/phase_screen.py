@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 import scipy.special
-from jaxtyping import Array, Complex, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float, PRNGKeyArray, Shaped
 
 from nlcwfs.constants import ARCSEC_RAD, KOLMOGOROV_STRUCTURE, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.errors import SettingsError
@@ -191,12 +191,16 @@ class PhaseScreens(eqx.Module):
             Optical path difference in metres.
         """
         key_high, key_low = jax.random.split(key)
-        rows, columns = self.low_waves_y.shape[1], self.low_waves_x.shape[1]
-        high = self.draw_fine(key_high)[:rows, :columns]
-        coefficient = self.draw_low(key_low)
-        low = jnp.einsum("w,wy,wx->yx", coefficient, self.low_waves_y, self.low_waves_x).real
-        opd_m = high + low
+        opd_m = self.cut(self.draw_fine(key_high)) + self.draw_long(key_low)
         return opd_m - opd_m.mean()
+
+    def cut(self, fine_m: Shaped[Array, "Y X"]) -> Shaped[Array, "y x"]:
+        """The part of a periodic map that the grid shows."""
+        return fine_m[: self.low_waves_y.shape[1], : self.low_waves_x.shape[1]]
+
+    def draw_long(self, key: PRNGKeyArray) -> Float[Array, "y x"]:
+        """The longer waves alone, on the grid."""
+        return jnp.einsum("w,wy,wx->yx", self.draw_low(key), self.low_waves_y, self.low_waves_x).real
 
     def draw_fine(self, key: PRNGKeyArray) -> Float[Array, "Y X"]:
         """The fine structure alone, over its whole period, beyond which it repeats."""

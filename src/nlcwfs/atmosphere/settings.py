@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_valid
 
 _LATER_KEYS = (
     "layer_fractions",
+    "layer_heights_km",
     "wind_speeds_m_per_s",
     "wind_directions_deg",
     "screen_width_m",
@@ -162,7 +163,14 @@ class AtmosphereSettings(BaseModel):
     layer_fractions: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(
         default=(1.0,),
         min_length=1,
-        description="share of the turbulence in each layer, sum 1; this and the winds are for sequences only",
+        description="share of the turbulence in each layer, sum 1; winds are for sequences only",
+    )
+    layer_heights_km: tuple[Annotated[float, Field(ge=0, le=100)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        examples=[(0.0, 10.0)],
+        description="height of each layer above the telescope, whose air then changes the amplitude, too "
+        "(scintillation, in single exposures); leave out for 0",
     )
     wind_speeds_m_per_s: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = Field(
         default=(10.0,), min_length=1, description="speed of the wind in each layer"
@@ -189,12 +197,18 @@ class AtmosphereSettings(BaseModel):
     @model_validator(mode="after")
     def _layers_agree(self) -> "AtmosphereSettings":
         layers = len(self.layer_fractions)
-        for name in ("wind_speeds_m_per_s", "wind_directions_deg"):
-            if len(getattr(self, name)) != layers:
+        for name in ("wind_speeds_m_per_s", "wind_directions_deg", "layer_heights_km"):
+            if len(getattr(self, name) or self.layer_fractions) != layers:
                 raise ValueError(f"{name} must be one per layer, {layers} as in layer_fractions")
         if abs(sum(self.layer_fractions) - 1) > 1e-6:
             raise ValueError("layer_fractions must sum to 1")
         return self
+
+    @property
+    def heights_m(self) -> tuple[float, ...]:
+        """Height of each layer; empty where all are at the telescope, so that nothing scintillates."""
+        heights_km = self.layer_heights_km or ()
+        return tuple(1e3 * height_km for height_km in heights_km) if any(heights_km) else ()
 
     @model_serializer(mode="wrap")
     def _without_wind_that_is_default(self, write: Callable[["AtmosphereSettings"], dict[str, Any]]) -> dict[str, Any]:
@@ -203,4 +217,5 @@ class AtmosphereSettings(BaseModel):
         unused = {
             name for name in _LATER_KEYS if getattr(self, name) == fields[name].get_default(call_default_factory=True)
         }
+        unused |= set() if self.heights_m else {"layer_heights_km"}
         return {name: value for name, value in values.items() if name not in unused}

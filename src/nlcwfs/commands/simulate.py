@@ -18,6 +18,7 @@ from nlcwfs.interop.frames_reconstruction import rms_m
 from nlcwfs.interop.simulated_frames import Shot, frames_of, pupil_of
 from nlcwfs.simulation.colours import colour_account
 from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, frame_key, turbulence, wavelength_m
+from nlcwfs.simulation.scintillation import scintillation_account
 from nlcwfs.simulation.sequence import SequenceSimulator, wind_layers
 from nlcwfs.simulation.starlight import starlight_per_s, with_exposures_of
 
@@ -217,6 +218,7 @@ def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot],
         f"{electrons:.0f} electrons were read.",
         *colour_account(config, simulator.air),
         f"Air: D/r0 = {ratio:.1f} at {colour}; seeing {frames.seeing_arcsec:.2g} arcsec at 0.5 um.",
+        *scintillation_account(config, simulator.air, simulator.high),
         f"True wavefront: {np.sqrt(np.mean(np.square(rms_nm))):.0f} nm rms on these pixels, tilt included{spread}.",
         f"Light outside the window: {', '.join(percent(float(share)) for share in lost)} of planes 1 to {planes}.",
         *([f"Static aberration: {static_nm:g} nm rms; TRUTH holds it, too."] if static_nm else []),

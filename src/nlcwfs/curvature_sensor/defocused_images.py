@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Shaped
 
 from nlcwfs.beam.field import pupil_field
 from nlcwfs.beam.fresnel import fresnel_transfer
@@ -120,34 +120,47 @@ class CurvatureSensor(eqx.Module):
             pixel_m=grid.pixel_m,
         )
 
-    def images(self, opd_m: Float[Array, "y x"], photons: float | Float[Array, ""]) -> Planes:
+    def images(
+        self,
+        opd_m: Float[Array, "y x"],
+        photons: float | Float[Array, ""],
+        *,
+        factor: Shaped[Array, "seen y x"] | None = None,
+    ) -> Planes:
         """The photons on every plane.
 
         Args:
             opd_m: Wavefront at the pupil, positive for a longer path; what lies outside the pupil does not count.
             photons: Photons of the whole sensor in one exposure.
+            factor: What multiplies the field at the pupil, an amplitude or a complex number: one map for all colours,
+                or one for each. See `beam.air_at_pupil`.
 
         Returns:
-            Photons per pixel; over all planes they sum to `photons`.
+            Photons per pixel; over all planes they sum to `photons`, but for what the factor takes or adds.
         """
         opd_m = opd_m.astype(self.static_opd_m.dtype) + self.static_opd_m
         kind, smear = self.transfer.dtype, self.visibility
         own_smear = smear if smear is not None and len(smear) > 1 else None  # else the sum is smeared, once
 
-        def light_of(wavelength_m, share, transfer, visibility) -> Array:
+        common = None if factor is None or len(factor) > 1 else factor[0]
+
+        def light_of(wavelength_m, share, transfer, visibility, own_factor) -> Array:
             near = pupil_field(self.pupil, opd_m, wavelength_m=wavelength_m, photons=share * photons)
+            changed = common if own_factor is None else own_factor
+            near = near if changed is None else near * changed.astype(kind)
             far = jnp.fft.ifft2(jnp.fft.fft2(near)[None] * (self.transfer[0] if transfer is None else transfer))
             light = self.flux_fractions[:, None, None] * (far.real**2 + far.imag**2)
             return light if visibility is None else jnp.fft.rfft2(light) * visibility.astype(kind)
 
         wavelengths_m, shares = self.spectrum.wavelengths_m, self.spectrum.shares
         if len(shares) == 1:
-            total = light_of(wavelengths_m[0], shares[0], None, None)
+            total = light_of(wavelengths_m[0], shares[0], None, None, None)
         else:
             own_transfer = self.transfer if len(self.transfer) > 1 else None
+            own_factor = factor if common is None else None
             colours = (jnp.asarray(wavelengths_m, opd_m.dtype), jnp.asarray(shares, opd_m.dtype))
             shape, dtype = (self.transfer.shape, opd_m.dtype) if own_smear is None else (own_smear.shape, kind)
-            dark, colours = jnp.zeros(shape[1:], dtype), (*colours, own_transfer, own_smear)
+            dark, colours = jnp.zeros(shape[1:], dtype), (*colours, own_transfer, own_smear, own_factor)
             total = jax.lax.scan(lambda sums, one: (sums + light_of(*one), None), dark, colours)[0]
         if smear is not None:
             waves = total if own_smear is not None else jnp.fft.rfft2(total) * smear[0].astype(kind)

@@ -18,6 +18,7 @@ from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.curvature_sensor.chromatic_lenses import LensLaw
 from nlcwfs.curvature_sensor.membrane import Moments, membrane_moments, moments_needed
 from nlcwfs.errors import SettingsError
+from nlcwfs.simulation.scintillation import refuse_heights
 
 TILTED_TO_FLAT = math.sqrt(1.0299 / 0.134)
 """Rms of Kolmogorov turbulence over a disc, tilt included, over that without tilt (Noll 1976, table IV)."""
@@ -174,7 +175,7 @@ def colour_account(config: Config, air: Turbulence) -> list[str]:
 
 
 def refuse_colours(config: Config, *, because: str) -> None:
-    """Refuse light of many colours, or a star of some size, where only one colour of a point is understood.
+    """Refuse light of many colours, a star of some size or that scintillates, where only steady light of one is known.
 
     Args:
         config: The settings.
@@ -190,6 +191,7 @@ def refuse_colours(config: Config, *, because: str) -> None:
         raise SettingsError("beam.spectrum.shape", f'must be "line" with {because}', f'"{config.beam.spectrum.shape}"')
     if config.atmosphere.star.size_mas:
         raise SettingsError("atmosphere.star.size_mas", f"must be 0 with {because}", config.atmosphere.star.size_mas)
+    refuse_heights(config, because=because)
 
 
 def _moments(config: Config) -> Moments:

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import scipy.fft
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
 from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence, mean_rms_m
+from nlcwfs.beam.air_at_pupil import HighAir
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
@@ -19,6 +20,7 @@ from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import fraction_outside_window, integrate_on_pixels
 from nlcwfs.detector.read import Detector, Frames
 from nlcwfs.simulation.colours import colours_of
+from nlcwfs.simulation.scintillation import high_air
 from nlcwfs.simulation.segment_aberrations import SegmentAberrations
 from nlcwfs.simulation.static_aberration import lit_part, static_aberration
 from nlcwfs.simulation.telescope import telescope
@@ -67,6 +69,7 @@ class ExposureSimulator(eqx.Module):
         factor: Cells of the light along a detector pixel.
         window: Detector pixels along y and x.
         stand: How the segments of the pupil stand; None where they stand still, or there are none.
+        high: Draws wavefronts and amplitudes of air at altitude, in place of `screens`; None where there is none.
 
     Examples:
         >>> from nlcwfs.config import load_config
@@ -89,6 +92,7 @@ class ExposureSimulator(eqx.Module):
     factor: int = eqx.field(static=True)
     window: tuple[int, int] = eqx.field(static=True)
     stand: SegmentAberrations | None = None
+    high: HighAir | None = None
 
     @classmethod
     def build(cls, config: Config, shape: PupilShape | None = None) -> "ExposureSimulator":
@@ -132,6 +136,7 @@ class ExposureSimulator(eqx.Module):
             factor=config.simulation.light_oversampling,
             window=window,
             stand=SegmentAberrations.build(config.beam.segments, shape, light, pupil, dtype=dtype),
+            high=high_air(config, air, colours.spectrum, shape=pupil[cut].shape, pixel_m=light.pixel_m),
         )
 
     @property
@@ -147,21 +152,25 @@ class ExposureSimulator(eqx.Module):
             key: Random key of this frame, see `frame_key`.
         """
         key_sky, key_detector = jax.random.split(key)
-        opd_m = self.on_light(self.screens.draw(key_sky))
+        opd_m, factor = (self.screens.draw(key_sky), None) if self.high is None else self.high.draw(key_sky)
+        opd_m = self.on_light(opd_m)
         if self.stand is not None:
             opd_m = opd_m + self.stand.draw(key)
-        return self.expose_to(opd_m, key_detector)
+        return self.expose_to(opd_m, key_detector, factor=None if factor is None else jax.vmap(self.on_light)(factor))
 
     @eqx.filter_jit
-    def expose_to(self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray) -> Exposure:
+    def expose_to(
+        self, opd_m: Float[Array, "Y X"], key: PRNGKeyArray, *, factor: Shaped[Array, "seen Y X"] | None = None
+    ) -> Exposure:
         """Expose the detector once to a wavefront that is given.
 
         Args:
             opd_m: Wavefront on the grid of the light; what lies outside the pupil, and piston, do not count.
             key: Random key of the detector's noise.
+            factor: What else multiplies the field at the pupil, see `CurvatureSensor.images`.
         """
         opd_m = self.levelled(opd_m)
-        return self.read(opd_m, self.sensor.images(opd_m, self.photons).photons, key)
+        return self.read(opd_m, self.sensor.images(opd_m, self.photons, factor=factor).photons, key)
 
     def levelled(self, opd_m: Float[Array, "Y X"]) -> Float[Array, "Y X"]:
         """A wavefront without its piston and without what lies outside the pupil."""
@@ -196,8 +205,8 @@ class ExposureSimulator(eqx.Module):
         """Share of the pupil's light on every detector pixel."""
         return integrate_on_pixels(self.weights[None], factor=self.factor, window=self.window)[0]
 
-    def on_light(self, opd_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "Y X"]:
-        """A wavefront on the part of the grid that holds the pupil, zero around it."""
+    def on_light(self, opd_m: Shaped[Array, "lit_y lit_x"]) -> Shaped[Array, "Y X"]:
+        """A wavefront, or a factor, on the part of the grid that holds the pupil, zero around it."""
         margins = [((whole - part) // 2,) * 2 for whole, part in zip(self.light.shape, opd_m.shape, strict=True)]
         return jnp.pad(opd_m, margins)
 

@@ -14,6 +14,7 @@ from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator, frame_key
+from nlcwfs.simulation.scintillation import refuse_heights
 
 SCREEN_DIAMETERS = 12
 """Width of the air in diameters of the telescope; 8 m and 10 m/s give 9 s, and Table 1 a screen of 75 MB."""
@@ -69,6 +70,7 @@ class SequenceSimulator(eqx.Module):
         rate_hz = config.simulation.rate_hz
         if rate_hz is None:
             raise SettingsError("simulation.rate_hz", "must be given for a sequence (--rate HZ)", "nothing")
+        refuse_heights(config, because="sequences and loops: only single exposures scintillate yet")
         still = ExposureSimulator.build(config, pupil)
         if still.stand is not None:
             rule = "must have no pistons and tilts in a sequence or a loop: only single exposures know them yet"
