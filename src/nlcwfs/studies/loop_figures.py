@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from nlcwfs.studies.image_profiles import ANGLE, read_profiles
 from nlcwfs.studies.study_table import Row
@@ -17,6 +18,9 @@ RATE, MAGNITUDE = "loop.rate_hz", "atmosphere.star.magnitude"
 
 LEAST_RATES = 3
 """Fewer are no curve."""
+
+FEWEST_TICKS = 3
+"""With fewer of the usual ones an axis has ticks of its own."""
 
 
 def draw_rates(folder: Path, rows: Sequence[Row]) -> Figure | None:
@@ -139,6 +143,8 @@ def _residual_axis(axes: Axes, *, along: Literal["x", "y"] = "y") -> None:
     (axes.set_xlabel if along == "x" else axes.set_ylabel)("residual wavefront [nm rms]")
     low, high = axes.get_xlim() if along == "x" else axes.get_ylim()
     ticks = [tick for tick in (20, 30, 40, 60, 80, 100, 120, 150, 200, 300, 500, 1000, 2000) if low < tick < high]
+    if len(ticks) < FEWEST_TICKS:
+        ticks = [tick for tick in MaxNLocator(6, integer=True).tick_values(low, high) if low < tick < high]
     log_axis(axes, ticks, along=along)
     (axes.set_xlim if along == "x" else axes.set_ylim)(low, high)
     axes.grid(alpha=0.3)
