@@ -168,7 +168,7 @@ class AtmosphereSettings(BaseModel):
     layer_heights_km: tuple[Annotated[float, Field(ge=0, le=100)], ...] | None = Field(
         default=None,
         min_length=1,
-        examples=[(0.0, 10.0)],
+        examples=[(10.0,)],
         description="height of each layer above the telescope, whose air then changes the amplitude, too "
         "(scintillation, in single exposures); leave out for 0",
     )
