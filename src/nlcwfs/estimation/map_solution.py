@@ -91,12 +91,14 @@ class Found(NamedTuple):
         search: The solutions.
         slope: Starting tilt (y, x), metres per metre.
         strength: Variance of the turbulence over that of the prior.
+        wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
     """
 
     task: Task
     search: Search
     slope: Float[Array, "2"]
     strength: Float[Array, ""]
+    wrong_turn: Float[Array, ""] | None = None
 
 
 def seen_modes(task: Task) -> Float[Array, ""]:
