@@ -202,7 +202,7 @@ def misfit(task: Task, model: Float[Array, "plane v u"]) -> Float[Array, ""]:
 def disagreement_rad(task: Task, a: Unknown, b: Unknown) -> Float[Array, ""]:
     """Rms over the pupil of the difference of two solutions, piston excluded."""
     difference = task.problem.prior.phase_rad(a) - task.problem.prior.phase_rad(b)
-    if task.prior.steps is not None and task.level.colours is None:  # one colour does not tell its whole turns
+    if task.prior.steps is not None:  # its whole turns no colour tells, or are looked for when all else is found
         turns = task.prior.steps.means(difference) / (2 * jnp.pi)
         difference = difference - 2 * jnp.pi * jnp.round(turns - turns.ravel()[jnp.argmax(task.level.weight)])
     weight = task.level.weight

@@ -1,13 +1,25 @@
 """Whole wavelengths of the steps between segments: light of many colors tells them, one color does not."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.estimation.map_solution import Search, Solution, Task, solved
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.whitened_phase import Unknown
+
+PAIRS_UP_TO = 12
+"""Segments of a pupil of which two are moved at once: their number goes with the square."""
+
+REACH = 3
+"""Turns that one segment is moved at once: a first guess of steps up to two waves may be so far off."""
+
+NEAR = 30.0
+"""A try that is less likely by more nats than this after its first step is given up."""
 
 
 def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tuple[Search, Float[Array, ""] | None]:
@@ -28,8 +40,9 @@ def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tupl
 def on_best_turns(task: Task, settings: MapSettings, search: Search) -> tuple[Search, Float[Array, ""]]:
     """The solution with whole wavelengths added to segments where that makes it more likely, all else solved again.
 
-    One segment after the other goes a wavelength up and down, until none gains by it. A wrong turn is a maximum of its
-    own: its fringes have less contrast, and those of other colors are shifted.
+    Each of `moves_of` is tried until none gains. A wrong turn is a maximum of its own: its fringes have less contrast,
+    and those of other colors are shifted. Two segments that are off together may hold each other, and far off, where
+    there are no fringes left, one turn makes no difference. A try takes one step, and more if it may win.
 
     Args:
         task: The exposure, with a model of many colors and segments.
@@ -38,29 +51,36 @@ def on_best_turns(task: Task, settings: MapSettings, search: Search) -> tuple[Se
 
     Returns:
         The search, its best solution on the turns found; and the probability that these are wrong: the share of the
-        posterior of all solutions that are one turn of one segment away. It is 1 if the sweeps were used up before
-        the turns came to rest.
+        posterior of all solutions that were tried around it. It is 1 if the sweeps were used up before the turns came
+        to rest.
 
     Raises:
         ValueError: If the pupil has no segments.
 
     Examples:
-        >>> settings = MapSettings(wavelengths=5, turn_sweeps=4)
-        >>> most_tries(settings, segments=7)
-        56
+        >>> on_best_turns(None, MapSettings(), None)  # see tests/physics/test_segment_turns.py for what it finds
+        Traceback (most recent call last):
+        ...
+        AttributeError: 'NoneType' object has no attribute 'prior'
     """
     steps = task.prior.steps
     if steps is None:
         raise ValueError("prior.steps: must be there, got None")
     turn = 2 * jnp.pi / steps.rms_rad[0]
+    quick = settings.model_copy(update={"steps": 1})
+    moves = jnp.asarray(moves_of(steps.count), search.best.cost.dtype)
+
+    def more(solution: Solution) -> Solution:
+        return solved(task, settings, solution.unknown, (solution.steps, solution.ffts))
 
     def visit(number: Int[Array, ""], carry: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
         best, told, changed = carry
-        place, sign = 2 + number // 2, 1 - 2 * (number % 2)
-        slope = best.unknown.slope
-        moved = Unknown(best.unknown.waves, slope.at[place].add(sign * turn))
-        tried = solved(task, settings, moved, (best.steps, best.ffts))
-        came_back = jnp.abs(tried.unknown.slope[place] - slope[place]) < turn / 2
+        pistons, rest = best.unknown.slope[2 : 2 + steps.count], best.unknown.slope[2 + steps.count :]
+        slope = jnp.concatenate([best.unknown.slope[:2], pistons + turn * moves[number], rest])
+        first = solved(task, quick, Unknown(best.unknown.waves, slope), (best.steps, best.ffts))
+        tried = jax.lax.cond(first.cost < best.cost + NEAR, more, lambda solution: solution, first)
+        went = tried.unknown.slope[2 : 2 + steps.count] - pistons
+        came_back = jnp.dot(went, moves[number]) < turn / 2 * jnp.dot(moves[number], moves[number])
         better = tried.cost < best.cost
         told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, best.cost)))
         kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
@@ -74,7 +94,7 @@ def on_best_turns(task: Task, settings: MapSettings, search: Search) -> tuple[Se
     def goes_on(carry: tuple[Solution, Array, Array, Array]) -> Bool[Array, ""]:
         return carry[2] & (carry[3] < settings.turn_sweeps)
 
-    told = jnp.full(2 * steps.count, jnp.inf, search.best.cost.dtype)
+    told = jnp.full(len(moves), jnp.inf, moves.dtype)
     start = (search.best, told, jnp.asarray(True), jnp.asarray(0, jnp.int32))
     best, told, changed, _ = jax.lax.while_loop(goes_on, sweep, start)
     return search._replace(best=best), jnp.where(changed, 1.0, share_of_others(best.cost, told))
@@ -98,11 +118,23 @@ def share_of_others(cost: Float[Array, ""], others: Float[Array, " other"]) -> F
     return weights / (1 + weights)
 
 
-def most_tries(settings: MapSettings, *, segments: int) -> int:
-    """Solutions that `on_best_turns` makes at most.
+def moves_of(segments: int) -> Int[np.ndarray, "move segment"]:
+    """Turns that are added to the segments of a pupil: to one, to two, and to one up to `REACH`; no two are alike.
+
+    Turns of all segments together are no move: no light tells them. Of more than `PAIRS_UP_TO` segments no two move.
 
     Examples:
-        >>> most_tries(MapSettings(turn_sweeps=0), segments=4)
-        0
+        >>> moves_of(2).tolist(), len(moves_of(4)), len(moves_of(36))
+        ([[-1, 0], [1, 0], [-1, 1], [1, -1], [-3, 0], [3, 0]], 42, 216)
     """
-    return 2 * segments * settings.turn_sweeps
+    alone = np.eye(segments, dtype=int)
+    moves = [sign * one for one in alone for sign in (-1, 1)]
+    if segments <= PAIRS_UP_TO:
+        pairs = itertools.combinations(alone, 2)
+        moves += [first * one + second * other for one, other in pairs for first in (-1, 1) for second in (-1, 1)]
+    moves += [turns * one for far in range(2, REACH + 1) for one in alone for turns in (-far, far)]
+    unlike: dict[tuple[int, ...], np.ndarray] = {}
+    for move in moves:
+        unlike.setdefault(tuple(move - move[0]), move)
+    unlike.pop((0,) * segments, None)
+    return np.array(list(unlike.values())).reshape(-1, segments)
