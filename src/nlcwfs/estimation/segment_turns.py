@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.estimation.map_solution import Search, Solution, Task, solved
+from nlcwfs.estimation.segment_steps import SegmentSteps
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.whitened_phase import Unknown
 
@@ -23,81 +24,27 @@ NEAR = 30.0
 
 
 def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tuple[Search, Float[Array, ""] | None]:
-    """The search on its best turns and the probability that they are wrong; None where nothing tells.
-
-    Light of one color does not, and a pupil of one piece has none.
-
-    Examples:
-        >>> EstimationSettings().map.wavelengths > 1  # so nothing tells
-        False
-    """
-    asked = settings.map.turn_sweeps > 0 and settings.prior.segment_piston_nm > 0
-    if not asked or task.prior.steps is None or task.level.colours is None:
-        return search, None
-    return on_best_turns(task, settings.map, search)
-
-
-def on_best_turns(task: Task, settings: MapSettings, search: Search) -> tuple[Search, Float[Array, ""]]:
-    """The solution with whole wavelengths added to segments where that makes it more likely, all else solved again.
+    """The search, with whole wavelengths added to segments where that makes it more likely, all else solved again.
 
     Each of `moves_of` is tried until none gains. A wrong turn is a maximum of its own: its fringes have less contrast,
     and those of other colors are shifted. Two segments that are off together may hold each other, and far off, where
     there are no fringes left, one turn makes no difference. A try takes one step, and more if it may win.
 
     Args:
-        task: The exposure, with a model of many colors and segments.
+        task: The exposure.
         settings: Sweeps over the segments, and how each try is solved.
         search: What was found with the turns of the first guess.
 
     Returns:
         The search, its best solution on the turns found; and the probability that these are wrong: the share of the
         posterior of all solutions that were tried around it. It is 1 if the sweeps were used up before the turns came
-        to rest.
-
-    Raises:
-        ValueError: If the pupil has no segments.
-
-    Examples:
-        >>> on_best_turns(None, MapSettings(), None)  # see tests/physics/test_segment_turns.py for what it finds
-        Traceback (most recent call last):
-        ...
-        AttributeError: 'NoneType' object has no attribute 'prior'
+        to rest, and None where nothing tells turns: in one color, on one segment.
     """
     steps = task.prior.steps
-    if steps is None:
-        raise ValueError("prior.steps: must be there, got None")
-    turn = 2 * jnp.pi / steps.rms_rad[0]
-    quick = settings.model_copy(update={"steps": 1})
-    moves = jnp.asarray(moves_of(steps.count), search.best.cost.dtype)
-
-    def more(solution: Solution) -> Solution:
-        return solved(task, settings, solution.unknown, (solution.steps, solution.ffts))
-
-    def visit(number: Int[Array, ""], carry: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
-        best, told, changed = carry
-        pistons, rest = best.unknown.slope[2 : 2 + steps.count], best.unknown.slope[2 + steps.count :]
-        slope = jnp.concatenate([best.unknown.slope[:2], pistons + turn * moves[number], rest])
-        first = solved(task, quick, Unknown(best.unknown.waves, slope), (best.steps, best.ffts))
-        tried = jax.lax.cond(first.cost < best.cost + NEAR, more, lambda solution: solution, first)
-        went = tried.unknown.slope[2 : 2 + steps.count] - pistons
-        came_back = jnp.dot(went, moves[number]) < turn / 2 * jnp.dot(moves[number], moves[number])
-        better = tried.cost < best.cost
-        told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, best.cost)))
-        kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
-        return kept._replace(steps=tried.steps, ffts=tried.ffts), told, changed | better
-
-    def sweep(carry: tuple[Solution, Array, Array, Array]) -> tuple[Solution, Array, Array, Array]:
-        best, told, _, count = carry
-        best, told, changed = jax.lax.fori_loop(0, told.size, visit, (best, told, jnp.asarray(False)))
-        return best, told, changed, count + 1
-
-    def goes_on(carry: tuple[Solution, Array, Array, Array]) -> Bool[Array, ""]:
-        return carry[2] & (carry[3] < settings.turn_sweeps)
-
-    told = jnp.full(len(moves), jnp.inf, moves.dtype)
-    start = (search.best, told, jnp.asarray(True), jnp.asarray(0, jnp.int32))
-    best, told, changed, _ = jax.lax.while_loop(goes_on, sweep, start)
-    return search._replace(best=best), jnp.where(changed, 1.0, share_of_others(best.cost, told))
+    asked = settings.map.turn_sweeps > 0 and settings.prior.segment_piston_nm > 0
+    if not asked or steps is None or steps.count < 2 or task.level.colours is None:
+        return search, None
+    return _on_best_turns(task, steps, settings.map, search)
 
 
 def share_of_others(cost: Float[Array, ""], others: Float[Array, " other"]) -> Float[Array, ""]:
@@ -138,3 +85,40 @@ def moves_of(segments: int) -> Int[np.ndarray, "move segment"]:
         unlike.setdefault(tuple(move - move[0]), move)
     unlike.pop((0,) * segments, None)
     return np.array(list(unlike.values())).reshape(-1, segments)
+
+
+def _on_best_turns(
+    task: Task, steps: SegmentSteps, settings: MapSettings, search: Search
+) -> tuple[Search, Float[Array, ""]]:
+    turn = 2 * jnp.pi / steps.rms_rad[0]
+    quick = settings.model_copy(update={"steps": 1})
+    moves = jnp.asarray(moves_of(steps.count), search.best.cost.dtype)
+
+    def more(solution: Solution) -> Solution:
+        return solved(task, settings, solution.unknown, (solution.steps, solution.ffts))
+
+    def visit(number: Int[Array, ""], carry: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
+        best, told, changed = carry
+        pistons, rest = best.unknown.slope[2 : 2 + steps.count], best.unknown.slope[2 + steps.count :]
+        slope = jnp.concatenate([best.unknown.slope[:2], pistons + turn * moves[number], rest])
+        first = solved(task, quick, Unknown(best.unknown.waves, slope), (best.steps, best.ffts))
+        tried = jax.lax.cond(first.cost < best.cost + NEAR, more, lambda solution: solution, first)
+        went = tried.unknown.slope[2 : 2 + steps.count] - pistons
+        came_back = jnp.dot(went, moves[number]) < turn / 2 * jnp.dot(moves[number], moves[number])
+        better = tried.cost < best.cost
+        told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, best.cost)))
+        kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
+        return kept._replace(steps=tried.steps, ffts=tried.ffts), told, changed | better
+
+    def sweep(carry: tuple[Solution, Array, Array, Array]) -> tuple[Solution, Array, Array, Array]:
+        best, told, _, count = carry
+        best, told, changed = jax.lax.fori_loop(0, told.size, visit, (best, told, jnp.asarray(False)))
+        return best, told, changed, count + 1
+
+    def goes_on(carry: tuple[Solution, Array, Array, Array]) -> Bool[Array, ""]:
+        return carry[2] & (carry[3] < settings.turn_sweeps)
+
+    told = jnp.full(len(moves), jnp.inf, moves.dtype)
+    start = (search.best, told, jnp.asarray(True), jnp.asarray(0, jnp.int32))
+    best, told, changed, _ = jax.lax.while_loop(goes_on, sweep, start)
+    return search._replace(best=best), jnp.where(changed, 1.0, share_of_others(best.cost, told))
