@@ -34,7 +34,6 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.estimation.first_guess:segmented_start": "the same",
     "nlcwfs.estimation.gauss_newton:step": "needs a sensor; `MaximumAPosteriori` shows what steps lead to",
     "nlcwfs.estimation.gauss_newton:direction_of_step": "the same",
-    "nlcwfs.estimation.segment_turns:with_turns": "needs a sensor and its light; docs/pupils.md shows it",
     "nlcwfs.estimation.flow_filter:modal_information": "needs a sensor and its light",
     "nlcwfs.simulation.closed_loop.sensor:build_sensor": "needs a loop's light; `nlcwfs loop` shows it",
     "nlcwfs.simulation.closed_loop.air:learnt_air": "needs a loop's telemetry; `nlcwfs loop` shows it",
