@@ -58,6 +58,18 @@ def test_reconstruct_tells_how_good_the_steps_are(frames, tmp_path):
     assert "whole wavelengths off in 0 of 1 frames" in line
 
 
+def test_reconstruct_tells_whole_wavelengths_of_a_band(tmp_path):
+    """Steps of up to 1.7 wavelengths; the model has five wavelengths, the light more than twice as many."""
+    path, found = tmp_path / "frames.fits", tmp_path / "wavefront.fits"
+    light = {"beam__spectrum__shape": "flat", "beam__spectrum__bandwidth_ratio": 0.5, "beam__spectrum__wavelengths": 15}
+    pixels = {"detector__pixels_across_pupil": 20, "detector__window_pixels": 40, "atmosphere__photons": 1e5}
+    assert simulate(path, **light, **pixels, beam__segments__pistons_nm=[0, 700, -400, 300]).exit_code == 0
+    result = type_in("reconstruct", path, "--out", found, "--set", "estimation.map.wavelengths=5")
+    assert "Segments: 4. Whole wavelengths of the steps are right with probability 0.9999 or more." in result.output
+    assert "whole wavelengths off in 0 of 1 frames" in result.output
+    assert 0 <= fits.getval(found, "WRONGTRN") < 1e-4
+
+
 def test_a_hand_written_map_of_segments_is_filled_to_the_rim(frames, tmp_path):
     path = tmp_path / "hand.fits"
     with fits.open(frames) as hdus:

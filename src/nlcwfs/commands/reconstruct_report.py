@@ -19,6 +19,9 @@ from nlcwfs.simulation.segment_score import segment_score
 FEW_FRAMES = 20
 """Up to here each frame gets a line, beyond only those that failed."""
 
+SURE = 5e-5
+"""Probabilities of a wrong turn below this are not told apart: a likelihood is no better than its model."""
+
 
 def frame_warnings(frames: FramesFile, settings: EstimationSettings) -> list[str]:
     """What the user should know about the frames before believing a wavefront."""
@@ -127,8 +130,8 @@ def step_lines(frames: FramesFile, wavefront: WavefrontFile) -> list[str]:
     if frames.segments is None:
         return []
     count, nm = int(frames.segments.max()) + 1, frames.wavelength_m * 1e9
-    lines = [f"Segments: {count}. One color tells the steps between them only up to whole wavelengths of {nm:.0f} nm."]
     good = [number for number, outcome in enumerate(wavefront.outcomes) if is_success(outcome)]
+    lines = [f"Segments: {count}. {turn_sentence(wavefront, good, nm)}"]
     if frames.truth_m is None or not good:
         return lines
     pupil = np.ones(frames.segments.shape) if frames.pupil is None else frames.pupil
@@ -147,6 +150,16 @@ def step_lines(frames: FramesFile, wavefront: WavefrontFile) -> list[str]:
         f"Steps: error {piston_nm:.2g} nm rms modulo the wavelength, {inside_nm:.1f} nm inside the segments (median, "
         f"against TRUTH); whole wavelengths off in {off} of {len(scores)} frames.",
     ]
+
+
+def turn_sentence(wavefront: WavefrontFile, good: list[int], nm: float) -> str:
+    """Whether the whole wavelengths of the steps are known, of the frames with a wavefront."""
+    if wavefront.wrong_turn is None or not good:
+        return f"One color tells the steps between them only up to whole wavelengths of {nm:.0f} nm."
+    wrong = float(np.max(wavefront.wrong_turn[good]))
+    least = "0.9999 or more" if wrong < SURE else f"{1 - wrong:.4f}"
+    where = "" if len(good) == 1 else " in the worst frame"
+    return f"Whole wavelengths of the steps are right with probability {least}{where}."
 
 
 def frame_line(wavefront: WavefrontFile, number: int) -> str:

@@ -86,6 +86,13 @@ class MapSettings(BaseModel):
         le=1000000,
         description="FFTs for each frame of a sequence after the first, of each wavelength of the model; fixed",
     )
+    turn_sweeps: int = Field(
+        default=6,
+        ge=0,
+        le=100,
+        description="most times that each segment of a pupil is tried a wavelength higher and lower, in a model of "
+        "many wavelengths; 0 leaves the whole wavelengths of the first guess",
+    )
     sequence_steps: int = Field(
         default=3, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"
     )

@@ -91,12 +91,14 @@ class Found(NamedTuple):
         search: The solutions.
         slope: Starting tilt (y, x), metres per metre.
         strength: Variance of the turbulence over that of the prior.
+        wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
     """
 
     task: Task
     search: Search
     slope: Float[Array, "2"]
     strength: Float[Array, ""]
+    wrong_turn: Float[Array, ""] | None = None
 
 
 def seen_modes(task: Task) -> Float[Array, ""]:
@@ -200,7 +202,7 @@ def misfit(task: Task, model: Float[Array, "plane v u"]) -> Float[Array, ""]:
 def disagreement_rad(task: Task, a: Unknown, b: Unknown) -> Float[Array, ""]:
     """Rms over the pupil of the difference of two solutions, piston excluded."""
     difference = task.problem.prior.phase_rad(a) - task.problem.prior.phase_rad(b)
-    if task.prior.steps is not None and task.level.colours is None:  # one colour does not tell its whole turns
+    if task.prior.steps is not None:  # its whole turns no colour tells, or are looked for when all else is found
         turns = task.prior.steps.means(difference) / (2 * jnp.pi)
         difference = difference - 2 * jnp.pi * jnp.round(turns - turns.ravel()[jnp.argmax(task.level.weight)])
     weight = task.level.weight

@@ -24,6 +24,7 @@ from nlcwfs.estimation.phase_prior import expected_air, prior_power
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS, TYPICAL_SEEING_ARCSEC, Climb, GerchbergSaxton
 from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, sum_blocks
 from nlcwfs.estimation.segment_steps import SegmentSteps, steps_of
+from nlcwfs.estimation.segment_turns import with_turns
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.sensor_model import PlaneScale, light_on_pixels, mean_counts, plane_scale
 from nlcwfs.estimation.settings import EstimationSettings
@@ -170,7 +171,8 @@ class MaximumAPosteriori(eqx.Module):
         climb = with_strength(self.capture, near, climb) if self.steps is None else self.on_segments(near, climb)
         task, unknown = self.prepared(near, slope, climb, mirror_rad)
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
-        return Found(task, search, slope, climb.strength)
+        search, wrong_turn = with_turns(task, self.settings, search)
+        return Found(task, search, slope, climb.strength, wrong_turn)
 
     def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """A phase of the model's grid on that of the first guess."""
@@ -287,6 +289,7 @@ class MaximumAPosteriori(eqx.Module):
             outcome_code=code,
             strength=strength,
             error_bars=bars,
+            wrong_turn=found.wrong_turn,
         )
 
     def on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:

@@ -21,6 +21,7 @@ class WavefrontEstimate(eqx.Module):
         outcome_code: `Outcome` as a number.
         strength: Variance of the turbulence over that of 0.6" seeing, as given or as measured.
         error_bars: Error of every mode; None where the method tells none.
+        wrong_turn: Probability that a segment of the pupil is whole wavelengths off; None where nothing tells.
     """
 
     opd_m: Float[Array, "*frame y x"]
@@ -32,6 +33,7 @@ class WavefrontEstimate(eqx.Module):
     outcome_code: Int[Array, "*frame"]
     strength: Float[Array, "*frame"]
     error_bars: ErrorBars | None = None
+    wrong_turn: Float[Array, "*frame"] | None = None
 
     @property
     def outcome(self) -> Outcome:

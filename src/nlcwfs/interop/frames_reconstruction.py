@@ -173,6 +173,7 @@ class FramesReconstructor(eqx.Module):
             error_nm=None if truth_m is None else rms_m(opd_m - truth_m, self.weights) * 1e9,
             quantum_limit_nm=limit_nm,
             photon_loss=loss,
+            wrong_turn=None if estimate.wrong_turn is None else float(estimate.wrong_turn),
             residual=residual,
             sentence=estimate.outcome.sentence,
         )

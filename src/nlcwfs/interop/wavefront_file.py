@@ -34,6 +34,7 @@ class FrameWavefront:
         error_nm: rms of (found - true), piston removed; None when the truth is not known.
         quantum_limit_nm: Error that no sensor could beat with this light; None when the method tells none.
         photon_loss: Photons that the sensor needs relative to that limit; None when the method tells none.
+        wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
         residual: Data - model in electrons.
         sentence: What the outcome means here.
     """
@@ -50,6 +51,7 @@ class FrameWavefront:
     error_nm: float | None = None
     quantum_limit_nm: float | None = None
     photon_loss: float | None = None
+    wrong_turn: float | None = None
     residual: Float[np.ndarray, "plane y x"] | None = None
     sentence: str = ""
 
@@ -90,6 +92,7 @@ class WavefrontFile:
     error_nm: Float[np.ndarray, " frame"] | None = None
     quantum_limit_nm: Float[np.ndarray, " frame"] | None = None
     photon_loss: Float[np.ndarray, " frame"] | None = None
+    wrong_turn: Float[np.ndarray, " frame"] | None = None
     residual: Float[np.ndarray, "frame plane y x"] | None = None
     source: str = ""
     source_digest: str = ""
@@ -160,8 +163,7 @@ class WavefrontFile:
             coefficient_m=column("coefficient_m", no_modes),
             sigma_m=column("sigma_m", no_modes),
             error_nm=column("error_nm", np.nan) if frames.truth_m is not None else known("error_nm"),
-            quantum_limit_nm=known("quantum_limit_nm"),
-            photon_loss=known("photon_loss"),
+            **{name: known(name) for name in ("quantum_limit_nm", "photon_loss", "wrong_turn")},
             residual=known("residual", np.full(shape[1:], np.nan)),
             source=frames.source,
             source_digest=frames.source_digest,
@@ -193,6 +195,7 @@ class WavefrontFile:
             error_nm=told(self.error_nm),
             quantum_limit_nm=told(self.quantum_limit_nm),
             photon_loss=told(self.photon_loss),
+            wrong_turn=told(self.wrong_turn),
             residual=None if self.residual is None else self.residual[number],
             sentence=self.sentences[number],
         )

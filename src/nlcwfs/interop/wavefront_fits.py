@@ -20,10 +20,11 @@ _NUMBERS = {
     "ERR_NM": ("error_nm", "[nm] rms of error, no piston"),
     "QLIMIT": ("quantum_limit_nm", "[nm] error at the quantum limit"),
     "PHOTLOSS": ("photon_loss", "photons needed over those at QLIMIT"),
+    "WRONGTRN": ("wrong_turn", "probability of a segment whole waves off"),
 }
 """Keyword, field of the record and comment; with several frames the field is a column of FRAMES instead."""
 
-_OPTIONAL = ("ERR_NM", "QLIMIT", "PHOTLOSS")
+_OPTIONAL = ("ERR_NM", "QLIMIT", "PHOTLOSS", "WRONGTRN")
 """Left out where they are not known."""
 
 
