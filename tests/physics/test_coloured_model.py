@@ -9,7 +9,7 @@ import pytest
 
 from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
 from nlcwfs.beam.grid import Grid
-from nlcwfs.beam.light_band import Band
+from nlcwfs.beam.light_band import LightBand
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.spectrum import Spectrum
@@ -21,7 +21,7 @@ from nlcwfs.estimation.sensor_model import light_on_pixels
 from nlcwfs.estimation.settings import EstimationSettings
 
 TELESCOPE, WAVELENGTH_M, PLANES_M = PupilShape(2.0), 0.85e-6, (-219e3, -156e3, 156e3, 219e3)
-BAND = Band.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
+BAND = LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
 FRAME = Grid((36, 36), 2.0 / 24)
 FINER = 4
 
