@@ -3,7 +3,7 @@
 import pydantic
 import pytest
 
-from nlcwfs.beam.settings import BeamSettings, SpectrumSettings
+from nlcwfs.beam.settings import BeamSettings, SegmentsSettings, SpectrumSettings
 
 
 def test_defaults_are_table_1_of_the_paper():
@@ -13,8 +13,9 @@ def test_defaults_are_table_1_of_the_paper():
 
 
 def test_every_key_is_described():
-    assert all(field.description for name, field in BeamSettings.model_fields.items() if name != "spectrum")
-    assert all(field.description for field in SpectrumSettings.model_fields.values())
+    parts = {"spectrum": SpectrumSettings, "segments": SegmentsSettings}
+    assert all(field.description for name, field in BeamSettings.model_fields.items() if name not in parts)
+    assert all(field.description for part in parts.values() for field in part.model_fields.values())
 
 
 @pytest.mark.parametrize(

@@ -182,7 +182,7 @@ def test_a_file_that_cannot_be_read_is_one_line_that_names_it(tmp_path):
         (
             "beam.aperture_m=",
             "beam.aperture_m: unknown key, got nothing; known are diameter_m, obstruction_ratio, "
-            "spider_count, spider_width_m, spider_angle_deg, pupil_map, wavelength_um, spectrum",
+            "spider_count, spider_width_m, spider_angle_deg, pupil_map, segments, wavelength_um, spectrum",
         ),
         ("beam.diameter_m.x=3", "beam.diameter_m: must be a number from 0.01 to 100 [m], got {x = 3}"),
         ("beam=3", "beam: must be a section of keys, got 3"),

@@ -68,6 +68,7 @@ def full_record():
         background=rng.uniform(0.0, 2.0, (PLANES, HEIGHT, WIDTH)),
         bad_pixels=bad,
         truth_m=rng.normal(0.0, 5e-7, (2, HEIGHT, WIDTH)),
+        segments=np.broadcast_to(np.arange(WIDTH) > 6, (HEIGHT, WIDTH)).astype(int),
     )
 
 
@@ -290,7 +291,7 @@ def test_doubtful_optics_are_told(tmp_path):
     pupil = read_frames(write(tmp_path / "c.fits", light(), ("PUPIL", small))).warnings
     assert pupil == ("PUPIL: is 2.4 m wide, but TELDIAM is 8 m; is PIXSCALE right?",)
     other = read_frames(write(tmp_path / "d.fits", light(), ("PUPILLE", small))).warnings
-    assert other == ("PUPILLE: is not one of PUPIL, BACKGROUND, BADPIX, TRUTH, TIME, ignored",)
+    assert other == ("PUPILLE: is not one of PUPIL, SEGMENTS, BACKGROUND, BADPIX, TRUTH, TIME, ignored",)
     uneven = light() * np.array([0.1, 1, 1])[:, None, None]
     shares = read_frames(write(tmp_path / "e.fits", uneven)).warnings
     assert len(shares) == 1
