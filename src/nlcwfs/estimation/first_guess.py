@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 from nlcwfs.estimation.bayesian_unwrapping import unwrapped, unwrapping_ffts
 from nlcwfs.estimation.gerchberg_saxton import phase_noise
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS, Climb, GerchbergSaxton
-from nlcwfs.estimation.resolution_level import Level, Measurement
-from nlcwfs.estimation.segment_steps import DARK
+from nlcwfs.estimation.resolution_level import LIT, Level, Measurement
 from nlcwfs.estimation.turbulence_strength import slope_weights, updated_strength
 from nlcwfs.estimation.whitened_phase import WhitenedPhase
 
@@ -68,7 +67,7 @@ def segmented_start(
     """
     if prior.steps is None:
         raise ValueError("prior.steps: must be there, got None")
-    whole_rad = unwrapped(wrapped_rad, level.light > DARK, prior)
+    whole_rad = unwrapped(wrapped_rad, level.light > LIT, prior)
     smooth_rad = whole_rad - prior.steps.means(whole_rad)
     weights = jnp.asarray(slope_weights(level.grid), whole_rad.dtype)
     stronger = jnp.ones_like(noise_rad2)

@@ -19,6 +19,7 @@ from nlcwfs.estimation.gauss_newton import Problem
 from nlcwfs.estimation.prior_settings import PriorSettings
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.estimation.sequence_memory import Memory
+from nlcwfs.estimation.turbulence_filter import rms_of_power
 from nlcwfs.estimation.wave_sensitivity import LAGS
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
 
@@ -116,6 +117,10 @@ class FollowedAir(eqx.Module):
         tilt = self.whole.tilt_rms_rad**2 * memory.strength
         tilt_left_rad = jnp.sqrt(again * memory.tilt_left_rad**2 + (1 - again) * tilt)
         return dataclasses.replace(memory, phase_rad=mean_rad, left_open=left_open, tilt_left_rad=tilt_left_rad)
+
+    def left_rad2(self, memory: Memory) -> Float[Array, ""]:
+        """Variance of what is left open of waves and tilt."""
+        return rms_of_power(memory.left_open, self.whole.grid) ** 2 + 2 * memory.tilt_left_rad**2
 
     def prior(self, expected: Memory) -> WhitenedPhase:
         """Unknowns for what is open beside the expected mean."""

@@ -10,15 +10,11 @@ from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.bayesian_unwrapping import unwrapped, unwrapping_ffts
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.map_settings import MapSettings
-from nlcwfs.estimation.resolution_level import Level, Measurement
+from nlcwfs.estimation.resolution_level import LIT, Level, Measurement
 from nlcwfs.estimation.sensor_model import PlaneScale
 from nlcwfs.estimation.turbulence_filter import expected_error
 from nlcwfs.estimation.turn_islands import tearing_ffts, torn_phase
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
-
-LIT = 0.3
-"""Cells with at least this share of the light of a full one have a phase of their own."""
-
 
 SMALLEST_ISLAND_RAD = 0.1
 """Two solutions are one if they differ by less than this, whatever is expected: one pixel of a 45-pixel pupil that is a
@@ -156,13 +152,17 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
     def again(search: Search) -> Search:
         last = healed(task, settings, search.last)
         apart_rad = disagreement_rad(task, last.unknown, search.best.unknown)
-        better = last.cost < search.best.cost
-        best: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), last, search.best)
-        best = best._replace(steps=last.steps, ffts=last.ffts)
-        return Search(best, last, search.healings + 1, apart_rad < near_rad)
+        return Search(likelier(last, search.best), last, search.healings + 1, apart_rad < near_rad)
 
     start = Search(first, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
     return jax.lax.while_loop(lambda search: ~search.agreed & (search.healings < settings.healings), again, start)
+
+
+def likelier(tried: Solution, best: Solution) -> Solution:
+    """The more likely of two solutions, with the account of what was tried last."""
+    better = tried.cost < best.cost
+    kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
+    return kept._replace(steps=tried.steps, ffts=tried.ffts)
 
 
 def healed(task: Task, settings: MapSettings, solution: Solution) -> Solution:

@@ -22,7 +22,7 @@ from nlcwfs.estimation.map_verdict import map_verdict
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air, prior_power
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS, TYPICAL_SEEING_ARCSEC, Climb, GerchbergSaxton
-from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, sum_blocks
+from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, pixel_means
 from nlcwfs.estimation.segment_steps import SegmentSteps, steps_of
 from nlcwfs.estimation.segment_turns import with_turns
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
@@ -177,7 +177,7 @@ class MaximumAPosteriori(eqx.Module):
     def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """A phase of the model's grid on that of the first guess."""
         factor = self.level.oversampling
-        return cropped(sum_blocks(phase_rad[None], factor)[0] / factor**2, self.capture.levels[-1].grid.shape)
+        return pixel_means(phase_rad, factor, self.capture.levels[-1].grid.shape)
 
     def on_segments(self, near: Measurement, climb: Climb) -> Climb:
         """The first guess of a field, unwrapped segment by segment on the model's grid, and the strength it shows."""
@@ -295,4 +295,4 @@ class MaximumAPosteriori(eqx.Module):
     def on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """From the model's grid to the pixels of the frames: the mean over each."""
         factor = self.level.oversampling
-        return cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)
+        return pixel_means(array, factor, self.geometry.frame.shape)

@@ -14,7 +14,7 @@ from nlcwfs.estimation.centroid_tilt import centroid_tilt
 from nlcwfs.estimation.fit_quality import BELIEVED, speckle_band, unexplained_share, verdict
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.ladder import build_ladder
-from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, resample_phase, sum_blocks
+from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, pixel_means, resample_phase
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
 from nlcwfs.estimation.settings import EstimationSettings, GerchbergSaxtonSettings
 from nlcwfs.estimation.speckle_blur import unmodelled_variance
@@ -276,7 +276,7 @@ class GerchbergSaxton(eqx.Module):
     def _on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """From the finest grid to the pixels of the frames: the mean over each."""
         factor = self.levels[-1].oversampling
-        return cropped(sum_blocks(array[None], factor)[0] / factor**2, self.geometry.frame.shape)
+        return pixel_means(array, factor, self.geometry.frame.shape)
 
 
 class Climb(eqx.Module):

@@ -9,6 +9,9 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.estimation.speckle_blur import blurred
 
+LIT = 0.3
+"""Cells with at least this share of the light of a full one have a phase of their own."""
+
 
 class Measurement(eqx.Module):
     """The counts of one exposure, and which of them to use.
@@ -124,6 +127,11 @@ def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "p
     # Ten times faster than a sum over axes of `factor` pixels, which JAX walks through one by one.
     rows = jnp.asarray(sum(array[:, first::factor] for first in range(factor)))
     return jnp.asarray(sum(rows[:, :, first::factor] for first in range(factor)))
+
+
+def pixel_means(array: Float[Array, "y x"], factor: int, shape: tuple[int, int]) -> Float[Array, "v u"]:
+    """Mean over squares of `factor` x `factor` cells, of the middle of an array."""
+    return cropped(sum_blocks(array[None], factor)[0] / factor**2, shape)
 
 
 def cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:

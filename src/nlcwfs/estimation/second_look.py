@@ -15,8 +15,9 @@ import scipy.ndimage
 from jaxtyping import Array, Bool, Float
 
 from nlcwfs.estimation.angle import wrap
-from nlcwfs.estimation.map_solution import LIT, Solution, Task, solved
+from nlcwfs.estimation.map_solution import Solution, Task, solved
 from nlcwfs.estimation.maximum_a_posteriori import START_NOISE
+from nlcwfs.estimation.resolution_level import LIT
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.sequence_reconstructor import SequenceReconstructor
 from nlcwfs.estimation.tilt import tilt_phase

@@ -10,11 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.prior_settings import PriorSettings
-from nlcwfs.estimation.resolution_level import Level
+from nlcwfs.estimation.resolution_level import LIT, Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
-
-DARK = 0.3
-"""Cells with less light than this share of a full one have no phase of their own."""
 
 
 class SegmentSteps(eqx.Module):
@@ -74,7 +71,7 @@ class SegmentSteps(eqx.Module):
             dtype: Precision.
         """
         flat, count = labels.ravel(), int(labels.max()) + 1
-        seen = np.where(light > DARK, light, 0).ravel()
+        seen = np.where(light > LIT, light, 0).ravel()
         full = np.maximum(np.bincount(flat, seen, count), 1e-9)
         ramps = []
         for axis_m in np.broadcast_arrays(grid.y_m, grid.x_m):

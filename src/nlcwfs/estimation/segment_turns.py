@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.map_settings import MapSettings
-from nlcwfs.estimation.map_solution import Search, Solution, Task, solved
+from nlcwfs.estimation.map_solution import Search, Solution, Task, likelier, solved
 from nlcwfs.estimation.segment_steps import SegmentSteps
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.whitened_phase import Unknown
@@ -123,10 +123,8 @@ def _on_best_turns(
         tried = jax.lax.cond(first.cost < best.cost + NEAR, more, lambda solution: solution, first)
         went = (tried.unknown.slope - best.unknown.slope)[2 : 2 + steps.count]
         came_back = jnp.dot(went, moves[number]) < turn / 2 * jnp.dot(moves[number], moves[number])
-        better = tried.cost < best.cost
         told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, best.cost)))
-        kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
-        return kept._replace(steps=tried.steps, ffts=tried.ffts), told, changed | better
+        return likelier(tried, best), told, changed | (tried.cost < best.cost)
 
     def sweep(carry: tuple[Solution, Array, Array, Array]) -> tuple[Solution, Array, Array, Array]:
         best, told, _, count = carry
@@ -151,9 +149,7 @@ def _on_best_of_all(task: Task, steps: SegmentSteps, settings: MapSettings, best
     looked = gn.ffts_per_try(task.problem.counts.shape[0], colours=task.level.colour_count) * len(moves)
     move = moves[jnp.argmin(costs)]
     tried = solved(task, settings, _moved(steps, best.unknown, move), (best.steps, best.ffts + looked))
-    better = tried.cost < best.cost
-    kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
-    return kept._replace(steps=tried.steps, ffts=tried.ffts)
+    return likelier(tried, best)
 
 
 def _moved(steps: SegmentSteps, unknown: Unknown, turns: Float[Array, " segment"]) -> Unknown:

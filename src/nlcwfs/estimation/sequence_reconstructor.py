@@ -23,7 +23,7 @@ from nlcwfs.estimation.sequence_budget import fixed_ffts, inner_steps
 from nlcwfs.estimation.sequence_memory import Memory, plane_counts
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.tilt import mean_slope, tilt_phase
-from nlcwfs.estimation.turbulence_filter import half_plane_frequencies, rms_of_power
+from nlcwfs.estimation.turbulence_filter import half_plane_frequencies
 from nlcwfs.estimation.wave_sensitivity import roughness, seen_share
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown
@@ -219,7 +219,7 @@ class SequenceReconstructor(eqx.Module):
         dark = jnp.any(jnp.sum(jnp.where(task.measured.usable, problem.counts, 0), axis=(1, 2)) <= 0)
         code = jnp.where(dark, Outcome.NO_LIGHT, code)
         code = jnp.where(jnp.all(jnp.isfinite(opd_m)), code, Outcome.NOT_FINITE).astype(jnp.int32)
-        left = rms_of_power(after.left_open, solver.level.grid) ** 2 + 2 * after.tilt_left_rad**2 + task.beyond
+        left = self.air.left_rad2(after) + task.beyond
         residual = jnp.where(task.measured.usable, problem.counts - model, 0)
         return WavefrontEstimate(
             opd_m=opd_m,

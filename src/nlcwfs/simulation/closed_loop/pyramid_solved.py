@@ -21,10 +21,10 @@ from nlcwfs.estimation.maximum_a_posteriori import TILT_VARIANCE
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS
-from nlcwfs.estimation.resolution_level import cropped, sum_blocks
+from nlcwfs.estimation.resolution_level import pixel_means
 from nlcwfs.estimation.sequence_memory import Memory
 from nlcwfs.estimation.solved_pyramid import Solved, SolvedPyramid
-from nlcwfs.estimation.turbulence_filter import expected_power, rms_of_power
+from nlcwfs.estimation.turbulence_filter import expected_power
 from nlcwfs.mirror.mirror import Mirror
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.measurement import with_wind_of_air
@@ -129,7 +129,7 @@ class SearchingPyramid(eqx.Module):
         state = memory or SolvedState(None, None, 0)
         sight, matrix = self.matrix.measure(exposure, usable, mirror_m, state.matrix)
         if sight.outcome is Outcome.NO_LIGHT:
-            return sight, self.skip(state)[1] or state
+            return sight, self._skipped(state)
         seen = exposure.frames.electrons, usable, mirror_m
         if state.followed is None:
             solved, residual_m, left_m = self._started(*seen, self.mirror.opd_m(sight.residual_m))
@@ -144,33 +144,33 @@ class SearchingPyramid(eqx.Module):
 
     def skip(self, memory: SolvedState | None) -> tuple[None, SolvedState | None]:
         """An exposure later; see `LoopSensor`."""
-        if memory is None or memory.followed is None:
-            return None, memory
-        return None, memory._replace(followed=self.solver.air.expected(memory.followed))
+        return None, memory and self._skipped(memory)
+
+    def _skipped(self, state: SolvedState) -> SolvedState:
+        if state.followed is None:
+            return state
+        return state._replace(followed=self.solver.air.expected(state.followed))
 
     @eqx.filter_jit
     def _started(self, counts: Array, usable: Array, mirror_m: Array, residual_m: Array) -> tuple[Solved, Array, Array]:
+        known_rad, noise = -self._phase(mirror_m), self.matrix.read_variance
         guess_rad = self._phase(residual_m)
-        solved = self.solver.start(counts, usable, guess_rad, known_rad=-self._phase(mirror_m), **self._noise)
+        solved = self.solver.start(counts, usable, guess_rad, known_rad=known_rad, read_variance=noise)
         return solved, *self._account(solved)
 
     @eqx.filter_jit
     def _followed(self, counts: Array, usable: Array, mirror_m: Array, memory: Memory) -> tuple[Solved, Array, Array]:
-        solved = self.solver.follow(counts, usable, memory, known_rad=-self._phase(mirror_m), **self._noise)
+        known_rad, noise = -self._phase(mirror_m), self.matrix.read_variance
+        solved = self.solver.follow(counts, usable, memory, known_rad=known_rad, read_variance=noise)
         return solved, *self._account(solved)
-
-    @property
-    def _noise(self) -> dict[str, float]:
-        return {"read_variance": self.matrix.read_variance}
 
     def _phase(self, opd_m: Float[Array, "lit_y lit_x"]) -> Float[Array, "Y X"]:
         return self.on_model(opd_m) * (2 * np.pi / self.solver.air.whole.wavelength_m)
 
     def _account(self, solved: Solved) -> tuple[Float[Array, " mode"], Float[Array, ""]]:
         """Commands of the residual, and the error that is expected of it."""
-        air, memory = self.solver.air.whole, solved.memory
+        air = self.solver.air.whole
         metres = air.wavelength_m / (2 * np.pi)
         factor = round(self.frame.pixel_m / air.grid.pixel_m)
-        pixels = cropped(sum_blocks(solved.residual_rad[None], factor)[0] / factor**2, self.frame.shape)
-        left_rad2 = rms_of_power(memory.left_open, air.grid) ** 2 + 2 * memory.tilt_left_rad**2
-        return self.pixels(pixels * metres), jnp.sqrt(left_rad2) * metres
+        pixels = pixel_means(solved.residual_rad, factor, self.frame.shape)
+        return self.pixels(pixels * metres), jnp.sqrt(self.solver.air.left_rad2(solved.memory)) * metres
