@@ -9,7 +9,7 @@ from small_loop import small
 from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.loop import Loop
-from nlcwfs.simulation.closed_loop.run import LoopTelemetry, run_loop, still_wavelength_m
+from nlcwfs.simulation.closed_loop.run import LoopTelemetry, run_loop
 
 BAND = ("beam.spectrum.shape=flat", "beam.spectrum.bandwidth_ratio=0.4", "curvature_sensor.lenses=ideal")
 LOW = "atmosphere.dispersion.zenith_deg=45"
@@ -36,7 +36,7 @@ def test_dispersion_without_a_corrector_spoils_the_loop():
 def test_the_wavelength_of_sensing_is_not_that_of_the_bluest_colour():
     light = LoopLight.build(small(*BAND))
     assert len(light.still.sensor.spectrum.shares) > 1
-    assert still_wavelength_m(light) == pytest.approx(0.85e-6)
+    assert light.still.wavelength_m == pytest.approx(0.85e-6)
 
 
 @pytest.mark.parametrize("sensor", ["shack-hartmann", "pyramid"])

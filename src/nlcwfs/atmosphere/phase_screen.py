@@ -17,6 +17,9 @@ from nlcwfs.errors import SettingsError
 SUBHARMONIC_LEVELS = 14
 """Each level reaches three times lower frequencies; fourteen hold 99 % of the variance of Kolmogorov's tilt."""
 
+TILT_VARIANCE = 0.449
+"""Variance of Kolmogorov's tilt along one axis over (D / r0)^(5/3), rad^2 (Noll 1976, table 4)."""
+
 CELLS_PER_SIDE = 6
 """Every level cuts the unresolved square around frequency zero into 6 x 6 cells and leaves the inner 2 x 2."""
 
@@ -69,6 +72,10 @@ class Turbulence:
     def fried_at(self, wavelength_m: float) -> float:
         """Fried's parameter at another wavelength, which grows as its power 6/5."""
         return self.fried_m * (wavelength_m / self.wavelength_m) ** 1.2
+
+    def tilt_rms_rad(self, wavelength_m: float, *, diameter_m: float) -> float:
+        """Rms of Kolmogorov's tilt along one axis over a disc; an outer scale does not count."""
+        return math.sqrt(TILT_VARIANCE * (diameter_m / self.fried_at(wavelength_m)) ** (5 / 3))
 
     def opd_spectrum(self, frequency_per_m: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Power spectrum of the OPD in m^2 per (cycle/m)^2 (Noll 1976, eq. 21, in OPD)."""

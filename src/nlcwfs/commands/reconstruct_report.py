@@ -6,6 +6,7 @@ import numpy as np
 
 from nlcwfs.beam.pupil import inside
 from nlcwfs.commands.console import percent
+from nlcwfs.curvature_sensor.membrane import moments_of_model
 from nlcwfs.curvature_sensor.step_visibility import SeenPlanes, unseen_step
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.interop import FramesFile, WavefrontFile
@@ -29,6 +30,7 @@ def frame_warnings(frames: FramesFile, settings: EstimationSettings) -> list[str
     if frames.bandwidth_m > 0 and (settings.method != "map" or settings.map.wavelengths == 1):
         told = f"BANDWID: {frames.bandwidth_m:g} m are treated as one colour, {frames.wavelength_m:g} m"
         found.append(f"{told}; method map takes more, estimation.map.wavelengths")
+    found += motion_warning(frames, settings)
     usable = [number for number in range(len(frames.electrons)) if number not in frames.frame_problems]
     found += step_warning(frames, float(np.median(frames.photo_electrons()[usable].sum(axis=(1, 2, 3)))))
     twin = twin_warning(frames)
@@ -37,6 +39,19 @@ def frame_warnings(frames: FramesFile, settings: EstimationSettings) -> list[str
     if len(frames.frame_problems) > 10:
         found.append(f"{len(frames.frame_problems) - 10} more frames are left out")
     return found
+
+
+def motion_warning(frames: FramesFile, settings: EstimationSettings) -> list[str]:
+    """Which planes are taken to rest though a membrane moves them, or are followed in too few moments."""
+    farthest_m = max(map(abs, frames.distances_m))
+    light = {"wavelength_m": frames.wavelength_m, "diameter_m": frames.diameter_m}
+    dead_share = frames.membrane_dead_share
+    needed = moments_of_model(frames.membrane, distance_m=farthest_m, dead_share=dead_share, **light)
+    has = settings.map.membrane_moments if settings.method == "map" else 1
+    if has >= needed:
+        return []
+    told = "the planes are taken to rest" if has == 1 else f"{has} moments are few"
+    return [f"MEMBRANE: {told}; method map follows the {frames.membrane}, estimation.map.membrane_moments={needed}"]
 
 
 def header_lines(frames: FramesFile, reconstructor: FramesReconstructor, *, already: int) -> list[str]:

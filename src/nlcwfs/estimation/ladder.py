@@ -64,11 +64,12 @@ def build_ladder(
 def finest_level(
     geometry: SensorGeometry, turbulence: Turbulence, *, oversampling: int, window: float, dtype: str
 ) -> Level:
-    """The full resolution alone, in a window of at least so many telescopes, and in all colours of the model."""
+    """The full resolution alone, at least so many telescopes wide, in all colours and moments of the model."""
     shape = window_shape(geometry, 1, window)
     settings = GerchbergSaxtonSettings(oversampling=oversampling)
     level = _level(geometry, settings, turbulence, Grid(shape, geometry.frame.pixel_m), 1, (), dtype=dtype)
-    return dataclasses.replace(level, colours=geometry.in_colour(level.grid, dtype=dtype))
+    colours, moving = (light(level.grid, dtype=dtype) for light in (geometry.in_colour, geometry.in_motion))
+    return dataclasses.replace(level, colours=colours, moving=moving)
 
 
 def _check_cutoffs(cutoffs_cpa: tuple[float, ...]) -> None:

@@ -42,6 +42,13 @@ class MapSettings(BaseModel):
         description="Wavelengths by which the model stands for light of a band; 1 takes all light for that of the "
         "wavelength of sensing, as in the paper. Each costs as much as the first.",
     )
+    membrane_moments: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="Moments by which the model follows a membrane that vibrates like a sine; 1 lets its planes "
+        "rest at their mean distances. Each costs as much as the first, for each wavelength.",
+    )
     oversampling: int = Field(
         default=2, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
     )
@@ -84,7 +91,7 @@ class MapSettings(BaseModel):
         default=100,
         ge=1,
         le=1000000,
-        description="FFTs for each frame of a sequence after the first, of each wavelength of the model; fixed",
+        description="FFTs for each frame of a sequence after the first, of each wavelength and moment of the model",
     )
     turn_sweeps: int = Field(
         default=6,

@@ -179,7 +179,8 @@ def healed(task: Task, settings: MapSettings, solution: Solution) -> Solution:
     )
     whole_rad = unwrapped(torn_rad - problem.known_rad, level.light > LIT, task.prior)
     start = task.prior.start(whole_rad, noise_variance=1 / problem.information)
-    ffts = tearing_ffts(problem.counts.shape[0], settings.healing_iterations) + unwrapping_ffts() + 1
+    tearing = tearing_ffts(problem.counts.shape[0], settings.healing_iterations, moments=level.moment_count)
+    ffts = tearing + unwrapping_ffts() + 1
     return solved(task, settings, start, (solution.steps, solution.ffts + ffts))
 
 

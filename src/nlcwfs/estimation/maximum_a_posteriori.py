@@ -1,7 +1,6 @@
 """The maximum a posteriori wavefront: the one that photons and turbulence together make most likely."""
 
 import dataclasses
-import math
 
 import equinox as eqx
 import jax
@@ -32,9 +31,6 @@ from nlcwfs.estimation.speckle_blur import unmodelled_variance
 from nlcwfs.estimation.tilt import tilt_phase
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.estimation.whitened_phase import Unknown, WhitenedPhase
-
-TILT_VARIANCE = 0.449
-"""Variance of Kolmogorov's tilt along one axis over (D / r0)^(5/3), rad^2 (Noll 1976, table 4)."""
 
 START_NOISE = 0.1
 """Share of the phase noise that is filtered from the first guess, which is smooth already."""
@@ -117,12 +113,11 @@ class MaximumAPosteriori(eqx.Module):
             level.grid, settings.prior, air, wavelength_m=wavelength_m, diameter_m=diameter_m, lit_pixels=lit_cells
         )
         beyond = unmodelled_variance(air, wavelength_m=wavelength_m, cutoff_per_m=1 / (2 * level.grid.pixel_m))
-        over_fried = diameter_m / air.fried_at(wavelength_m)
         return cls(
             level=level,
             capture=capture,
             power=jnp.asarray(power, dtype),
-            tilt_rms_rad=jnp.asarray(math.sqrt(TILT_VARIANCE * over_fried ** (5 / 3)), dtype),
+            tilt_rms_rad=jnp.asarray(air.tilt_rms_rad(wavelength_m, diameter_m=diameter_m), dtype),
             beyond_cells=jnp.asarray(beyond, dtype),
             band=jnp.asarray(
                 speckle_band(Grid(level.measured_shape, geometry.frame.pixel_m), diameter_m=diameter_m), dtype

@@ -78,7 +78,9 @@ class Level(eqx.Module):
         gain: Length of a step.
         fast_forward: Share of the last step that is added ahead of the next one.
         tolerance_rad: An iteration that moves less ends the level.
-        colours: The sensor in all colours of a model of many; None where `optics`, of one colour, is the model.
+        colours: The sensor in all colours of a model of many, each once for every moment of a membrane that it follows;
+            None where `optics`, of one colour at rest, is the model.
+        moving: The same of one colour; None where the planes rest.
     """
 
     optics: CurvatureSensor
@@ -98,6 +100,7 @@ class Level(eqx.Module):
     doubt: float = eqx.field(static=True)
     tolerance_rad: float = eqx.field(static=True)
     colours: CurvatureSensor | None = None
+    moving: CurvatureSensor | None = None
 
     @property
     def measured_shape(self) -> tuple[int, int]:
@@ -106,8 +109,18 @@ class Level(eqx.Module):
 
     @property
     def colour_count(self) -> int:
-        """Wavelengths of the model."""
+        """Wavelengths of the model, each once for every moment of a membrane."""
         return 1 if self.colours is None else len(self.colours.spectrum.wavelengths_m)
+
+    @property
+    def moment_count(self) -> int:
+        """Moments by which the model follows a membrane."""
+        return 1 if self.moving is None else len(self.moving.spectrum.shares)
+
+    @property
+    def has_band(self) -> bool:
+        """Whether the model's light has several wavelengths."""
+        return self.colours is not None and len(set(self.colours.spectrum.wavelengths_m)) > 1
 
     def on_pixels(self, photons: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
         """What the measured pixels see of light on the model's grid."""

@@ -106,7 +106,7 @@ class SecondLook(eqx.Module):
             known_m: As it was told when the frame was followed.
         """
         seen = counts, usable, read_variance, known_m
-        ffts = tearing_ffts(counts.shape[0], TEARING)
+        ffts = tearing_ffts(counts.shape[0], TEARING, moments=self.sequence.solver.level.moment_count)
         regions = self._regions(np.asarray(self._torn(*seen, memory), float))
         change_rad, turned = jnp.zeros_like(memory.phase_rad), 0
         if not regions:

@@ -50,7 +50,7 @@ def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tupl
     """
     steps = task.prior.steps
     asked = settings.map.turn_sweeps > 0 and settings.prior.segment_piston_nm > 0
-    if not asked or steps is None or steps.count < 2 or task.level.colours is None:
+    if not asked or steps is None or steps.count < 2 or not task.level.has_band:
         return search, None
     return _on_best_turns(task, steps, settings.map, search)
 

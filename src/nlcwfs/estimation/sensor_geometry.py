@@ -11,6 +11,7 @@ from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
+from nlcwfs.curvature_sensor.membrane import Motion, membrane_moments, moving_light
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,9 @@ class SensorGeometry:
         spectrum: Wavelengths that stand for a band of light in a model of many colours; None where one is enough.
         colour_distances_m: Where each plane is in each of them; at `distances_m` in all when left out.
         star: Where each of them comes from, and how large the star is.
+        motion: Of a membrane that moves the planes; the distances are the mean ones.
+        moments: By which the model follows it, if it is a sine; 1 lets the planes rest.
+        dead_share: Of the membrane's half period, in which nothing is integrated.
     """
 
     pupil: PupilShape
@@ -40,6 +44,9 @@ class SensorGeometry:
     spectrum: Spectrum | None = None
     colour_distances_m: tuple[tuple[float, ...], ...] | None = None
     star: ApparentStar = POINT
+    motion: Motion = "none"
+    moments: int = 1
+    dead_share: float = 0.0
 
     def model(self, grid: Grid, *, dtype: str) -> CurvatureSensor:
         """The sensor's optics on a grid of the reconstructor."""
@@ -56,17 +63,26 @@ class SensorGeometry:
         )
 
     def in_colour(self, grid: Grid, *, dtype: str) -> CurvatureSensor | None:
-        """The optics in all colours of the model, without the static aberration; None where one colour is enough."""
+        """The optics in all colours and moments of the model, without the static aberration; None where it has one."""
         if self.spectrum is None:
+            return self.in_motion(grid, dtype=dtype)
+        rest_m = self.colour_distances_m or (self.distances_m,) * len(self.spectrum.shares)
+        return self._moved(grid, (self.spectrum, np.array(rest_m), self.star), dtype=dtype)
+
+    def in_motion(self, grid: Grid, *, dtype: str) -> CurvatureSensor | None:
+        """The same in one colour, and all moments; None where the planes rest."""
+        if self.motion != "sine" or self.moments == 1:
             return None
-        return CurvatureSensor.build(
-            self.pupil.on(grid),
-            grid,
-            distances_m=np.array(self.colour_distances_m) if self.colour_distances_m else self.distances_m,
-            spectrum=self.spectrum,
-            star=self.star,
-            dtype=dtype,
-        )
+        one = Spectrum.monochromatic(self.wavelength_m)
+        return self._moved(grid, (one, np.array([self.distances_m]), POINT), dtype=dtype)
+
+    def _moved(self, grid: Grid, rest: tuple[Spectrum, np.ndarray, ApparentStar], *, dtype: str) -> CurvatureSensor:
+        """The optics in some colours, with their planes at rest, and all moments."""
+        motion = self.motion if self.moments > 1 else "none"
+        moments = membrane_moments(motion, count=self.moments, dead_share=self.dead_share)
+        spectrum, places_m, star = moving_light(*rest, moments)
+        light = {"distances_m": places_m, "spectrum": spectrum, "star": star}
+        return CurvatureSensor.build(self.pupil.on(grid), grid, **light, dtype=dtype)
 
 
 def _resized(opd_m: Float[np.ndarray, "y x"], frame: Grid, grid: Grid) -> Float[np.ndarray, "v u"]:

@@ -40,23 +40,28 @@ def torn_phase(
         measured: The counts.
         scale: Counts of each plane.
         phase_rad: Where to start, everything included.
-        iterations: Passes over all planes; `4 * planes` FFTs each.
+        iterations: Passes over all planes, see `tearing_ffts`. Behind a membrane that moves a plane, the fields of all
+            moments get the same factor, and come back together.
         gain: Length of a step; 1 is Gerchberg and Saxton's.
     """
     floor = jnp.maximum(FLOOR * scale.counts * level.oversampling**2 / jnp.sum(level.light), FAINT)
     counts = jnp.where(measured.usable, measured.counts, 0)
 
+    moving = level.optics if level.moving is None else level.moving
+    shares = jnp.asarray(moving.spectrum.shares, level.modulus.dtype)[:, None, None]
+
     def through(phase_rad: Float[Array, "y x"], plane: tuple) -> tuple[Float[Array, "y x"], None]:
         transfer, seen, usable, gain_counts, background, noise = plane
-        far = jnp.fft.ifft2(jnp.fft.fft2(pupil_light(level, phase_rad)) * transfer)
-        model = gain_counts * level.on_pixels((far.real**2 + far.imag**2)[None])[0] + background
+        far = jnp.fft.ifft2(jnp.fft.fft2(pupil_light(level, phase_rad))[None] * transfer)
+        light = jnp.sum(shares * (far.real**2 + far.imag**2), axis=0)
+        model = gain_counts * level.on_pixels(light[None])[0] + background
         variance = (jnp.maximum(seen, 0) + model) / 2 + noise + measured.read_variance
         factor = 1 + gain * jnp.where(usable, seen - model, 0) / (2 * variance)
         factor = level.on_cells(jnp.clip(factor, 0, LARGEST_FACTOR)[None])[0]
-        back = jnp.fft.ifft2(jnp.fft.fft2(far * factor.astype(far.dtype)) * jnp.conj(transfer))
-        return angle(back), None
+        back = jnp.sum(shares * jnp.fft.fft2(far * factor.astype(far.dtype)) * jnp.conj(transfer), axis=0)
+        return angle(jnp.fft.ifft2(back)), None
 
-    planes = (level.optics.transfer[0], counts, measured.usable, scale.counts, scale.background, floor)
+    planes = (jnp.swapaxes(moving.transfer, 0, 1), counts, measured.usable, scale.counts, scale.background, floor)
     # From one side of the pupil to the other: neighbours in the list would pull the same way.
     order = jnp.asarray(_alternating(counts.shape[0]))
     planes = jax.tree.map(lambda part: part[order], planes)
@@ -67,14 +72,14 @@ def torn_phase(
     return jax.lax.scan(one, phase_rad, None, length=iterations)[0]
 
 
-def tearing_ffts(planes: int, iterations: int) -> int:
+def tearing_ffts(planes: int, iterations: int, *, moments: int = 1) -> int:
     """FFTs of `torn_phase`.
 
     Examples:
-        >>> tearing_ffts(4, 10)
-        160
+        >>> tearing_ffts(4, 10), tearing_ffts(4, 10, moments=8)
+        (160, 720)
     """
-    return 4 * planes * iterations
+    return (2 + 2 * moments) * planes * iterations
 
 
 def _alternating(count: int) -> list[int]:

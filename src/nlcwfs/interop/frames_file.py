@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nlcwfs.curvature_sensor.membrane import Motion
 from nlcwfs.errors import SettingsError
 
 
@@ -21,6 +22,8 @@ class FramesFile:
         obstruction_ratio: Diameter of the central obstruction over that of the telescope.
         bandwidth_m: Width of the band; 0 is one colour.
         chromatic_lenses: Whether distance times wavelength is constant; the distances are at `wavelength_m`.
+        membrane: How a membrane moves the planes while light is integrated; the distances are then the mean ones.
+        membrane_dead_share: Of the time, in which nothing is integrated.
         gain_electrons_per_adu: Gain of the detector, if known.
         read_noise_electrons: Its rms; 0 when the file does not say.
         dark_electrons: Dark electrons in every pixel of a frame.
@@ -62,6 +65,8 @@ class FramesFile:
     obstruction_ratio: float = 0.0
     bandwidth_m: float = 0.0
     chromatic_lenses: bool = False
+    membrane: Motion = "none"
+    membrane_dead_share: float = 0.0
     gain_electrons_per_adu: float | None = None
     read_noise_electrons: float = 0.0
     dark_electrons: float = 0.0

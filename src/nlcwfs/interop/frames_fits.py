@@ -211,6 +211,9 @@ def _optics_cards(frames: FramesFile) -> list[Card]:
         ("BANDWID", frames.bandwidth_m, "[m] width of the band"),
         ("CHROMLEN", frames.chromatic_lenses, "T: ZPLANE is proportional to 1/wavelength"),
     ]
+    if frames.membrane != "none":
+        cards.append(("MEMBRANE", frames.membrane, "it moves the planes, ZPLANE is the mean"))
+        cards.append(("MEMBDEAD", frames.membrane_dead_share, "share of the time without light"))
     for plane, distance_m in enumerate(frames.distances_m, start=1):
         cards.append((f"ZPLANE{plane}", distance_m, "[m] from the pupil, positive downstream"))
     for plane, share in enumerate(frames.flux_fractions or (), start=1):

@@ -41,21 +41,21 @@ def optics_fields(keywords: Keywords, plane_count: int) -> dict[str, Any]:
     )
     diameter_m = keywords.number("TELDIAM", "must be a positive number of metres", _positive)
     pixel_m = keywords.number("PIXSCALE", "must be a positive number of metres per pixel", _positive)
-    obstruction = keywords.optional_number(
-        "CENOBS", "must be a ratio of at least 0 and below 1", lambda value: 0 <= value < 1
-    )
+    obstruction = keywords.optional_number("CENOBS", "must be a ratio of at least 0 and below 1", _is_ratio)
     bandwidth_m = keywords.optional_number(
         "BANDWID", "must be in metres, at least 0 and below WAVELEN", lambda value: 0 <= value < wavelength_m
     )
+    distances_m = _distances_m(keywords, plane_count)
     return {
         "wavelength_m": wavelength_m,
         "diameter_m": diameter_m,
         "pixel_m": pixel_m,
-        "distances_m": _distances_m(keywords, plane_count),
+        "distances_m": distances_m,
         "flux_fractions": _flux_fractions(keywords, plane_count),
         "obstruction_ratio": obstruction or 0.0,
         "bandwidth_m": bandwidth_m or 0.0,
         "chromatic_lenses": keywords.flag("CHROMLEN"),
+        **_membrane(keywords, distances_m),
         "seeing_arcsec": keywords.optional_number("SEEING", "must be a positive number of arcsec", _positive),
     }
 
@@ -141,6 +141,24 @@ def _distances_m(keywords: Keywords, plane_count: int) -> tuple[float, ...]:
     return distances_m
 
 
+def _membrane(keywords: Keywords, distances_m: tuple[float, ...]) -> dict[str, Any]:
+    """How a membrane moves the planes; nothing where there is none."""
+    dead_share = keywords.optional_number("MEMBDEAD", "must be a share of at least 0 and below 1", _is_ratio)
+    if keywords.value("MEMBRANE") is None:
+        if dead_share:
+            raise keywords.error("MEMBDEAD", "must be left out without MEMBRANE", f"{dead_share:g}")
+        return {}
+    rule = "must be 'sine' or 'square'"
+    motion = keywords.text("MEMBRANE", rule).lower()
+    if motion not in ("sine", "square"):
+        raise keywords.error("MEMBRANE", rule, repr(motion))
+    if sorted(distances_m) != sorted(-one for one in distances_m):
+        listed = ", ".join(f"{distance_m:g}" for distance_m in distances_m)
+        rule = "must be pairs with MEMBRANE, one plane at +z for each at -z"
+        raise keywords.error(f"ZPLANE1..{len(distances_m)}", rule, listed)
+    return {"membrane": motion, "membrane_dead_share": dead_share or 0.0}
+
+
 def _flux_fractions(keywords: Keywords, plane_count: int) -> tuple[float, ...] | None:
     wanted = range(1, plane_count + 1)
     present = keywords.numbered("FLUXFR")
@@ -162,6 +180,10 @@ def _positive(value: float) -> bool:
 
 def _not_negative(value: float) -> bool:
     return value >= 0
+
+
+def _is_ratio(value: float) -> bool:
+    return 0 <= value < 1
 
 
 def _any(value: float) -> bool:

@@ -87,7 +87,8 @@ class FramesReconstructor(eqx.Module):
         """
         # SEEING of the header does not rule: behind a closed loop it tells nothing of the wavefronts that come, and a
         # filter told eleven times too strong a turbulence finds 2 % of the paper's frames (study 01, seeing-0.6).
-        geometry = sensor_geometry(frames, wavelengths=settings.map.wavelengths)
+        lights = {"wavelengths": settings.map.wavelengths, "moments": settings.map.membrane_moments}
+        geometry = sensor_geometry(frames, **lights)
         slopes = settings.method == "gerchberg-saxton" and settings.unwrapping == "slopes"
         basis = unwrapping_basis(geometry, scored_pupil(geometry), modes=settings.modes) if slopes else None
         solver = build_reconstructor(geometry, settings, basis=basis, dtype=dtype)

@@ -20,13 +20,14 @@ WELL_SEEN = 2.0
 tilt takes up noise from the last ones, because all are fitted together."""
 
 
-def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1) -> SensorGeometry:
+def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1, moments: int = 1) -> SensorGeometry:
     """The sensor that a file of frames describes, without a static aberration.
 
     Args:
         frames: The file.
         wavelengths: By which a model stands for the light of its band, which is taken as flat in photons; 1 takes all
             light for that of `WAVELEN`.
+        moments: By which it follows a membrane that vibrates like a sine; 1 lets the planes rest.
 
     Examples:
         >>> frames = FramesFile(
@@ -47,6 +48,9 @@ def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1) -> SensorGeomet
         wavelength_m=frames.wavelength_m,
         distances_m=frames.distances_m,
         flux_fractions=frames.flux_fractions,
+        motion=frames.membrane,
+        moments=moments,
+        dead_share=frames.membrane_dead_share,
     )
     if wavelengths == 1 or frames.bandwidth_m == 0:
         return geometry

@@ -77,7 +77,8 @@ class SequenceRun(eqx.Module):
             raise SettingsError("--sequence", "must come with --method map", settings.method)
         usable = [number for number in range(len(frames.electrons)) if number not in frames.frame_problems]
         photons = max(float(np.median(frames.photo_electrons()[usable].sum(axis=(1, 2, 3)))), 1.0)
-        geometry = sensor_geometry(frames, wavelengths=settings.map.wavelengths)
+        lights = {"wavelengths": settings.map.wavelengths, "moments": settings.map.membrane_moments}
+        geometry = sensor_geometry(frames, **lights)
         solver = SequenceReconstructor.build(
             geometry, settings, interval_s=times.interval_s, photons=photons, dtype=dtype
         )

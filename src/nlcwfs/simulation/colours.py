@@ -16,7 +16,13 @@ from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD
 from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
 from nlcwfs.curvature_sensor.chromatic_lenses import LensLaw
-from nlcwfs.curvature_sensor.membrane import Moments, membrane_moments, moments_needed
+from nlcwfs.curvature_sensor.membrane import (
+    Moments,
+    membrane_moments,
+    moments_needed,
+    moments_of_model,
+    moving_light,
+)
 from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.scintillation import refuse_heights
 
@@ -44,13 +50,8 @@ class Colours:
 
     def in_motion(self, moments: Moments) -> "Colours":
         """The same behind a membrane: each colour once for every moment."""
-        count, spectrum = len(moments.scales), self.spectrum
-        shares = tuple(colour * moment for colour in spectrum.shares for moment in moments.shares.tolist())
-        wavelengths_m = tuple(colour_m for colour_m in spectrum.wavelengths_m for _ in range(count))
-        moved = np.einsum("cp,m->cmp", self.distances_m, moments.scales).reshape(len(shares), -1)
-        directions = tuple(one for one in self.star.directions_rad for _ in range(count))
-        star = dataclasses.replace(self.star, directions_rad=directions)
-        return dataclasses.replace(self, spectrum=Spectrum(wavelengths_m, shares), distances_m=moved, star=star)
+        spectrum, moved_m, star = moving_light(self.spectrum, self.distances_m, self.star, moments)
+        return dataclasses.replace(self, spectrum=spectrum, distances_m=moved_m, star=star)
 
 
 def band_of(config: Config) -> LightBand | None:
@@ -168,14 +169,16 @@ def colour_account(config: Config, air: Turbulence) -> list[str]:
         lost = f", {sensor.membrane_dead_share:.0%} of the light lost in its dead time" * (
             sensor.membrane_dead_share > 0
         )
-        lines.append(f"Membrane: {sensor.membrane}, {len(_moments(config).scales)} moments{lost}.")
+        lines.append(f"Membrane: {sensor.membrane}, {_moments_told(config)}{lost}.")
     if star.size_mas:
         lines.append(f"Star: {star.profile} of {star.size_mas:g} mas.")
     return lines
 
 
 def refuse_colours(config: Config, *, because: str) -> None:
-    """Refuse light of many colours, a star of some size or that scintillates, where only steady light of one is known.
+    """Refuse light of many colours, from a star of some size or that scintillates, and planes that a membrane moves.
+
+    For what knows only steady light of one colour, and planes at rest.
 
     Args:
         config: The settings.
@@ -192,6 +195,25 @@ def refuse_colours(config: Config, *, because: str) -> None:
     if config.atmosphere.star.size_mas:
         raise SettingsError("atmosphere.star.size_mas", f"must be 0 with {because}", config.atmosphere.star.size_mas)
     refuse_heights(config, because=because)
+    refuse_membrane(config, because=because)
+
+
+def refuse_membrane(config: Config, *, because: str) -> None:
+    """Refuse a membrane where planes rest, or where there are none.
+
+    Args:
+        config: The settings.
+        because: What has no such planes, as in `loop.sensor = "pyramid"`.
+
+    Raises:
+        SettingsError: If the settings ask for one.
+
+    Examples:
+        >>> refuse_membrane(Config(), because="nlcwfs sensitivity")
+    """
+    motion = config.curvature_sensor.membrane
+    if motion != "none":
+        raise SettingsError("curvature_sensor.membrane", f'must be "none" with {because}', f'"{motion}"')
 
 
 def _moments(config: Config) -> Moments:
@@ -203,6 +225,22 @@ def _moments(config: Config) -> Moments:
         finest_per_m=config.mirror.cutoff_cpa / config.beam.diameter_m,
     )
     return membrane_moments(settings.membrane, count=count, dead_share=settings.membrane_dead_share)
+
+
+def _moments_told(config: Config) -> str:
+    """Moments of the light, and of a model that follows them."""
+    sensor, count = config.curvature_sensor, len(_moments(config).scales)
+    if count == 1:
+        return "at rest while light is integrated"
+    needed = moments_of_model(
+        sensor.membrane,
+        distance_m=max(map(abs, sensor.distances_km)) * 1e3,
+        wavelength_m=config.beam.wavelength_um * 1e-6,
+        diameter_m=config.beam.diameter_m,
+        dead_share=sensor.membrane_dead_share,
+    )
+    has = config.estimation.map.membrane_moments
+    return f"{count} moments; a model follows it with {needed}, this one has {has} (estimation.map.membrane_moments)"
 
 
 def _of_doublet(law: LensLaw) -> tuple[tuple[float, ...], tuple[str, ...]]:

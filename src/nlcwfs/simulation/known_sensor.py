@@ -12,25 +12,29 @@ from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, wavelengt
 
 
 def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
-    """What the reconstructor knows of the sensor: a static aberration, and the colours if its model has several."""
+    """What the reconstructor knows: a static aberration, colours and a membrane's motion if its model has them."""
     count, colours = config.estimation.map.wavelengths, None
     if count > 1 and config.beam.spectrum.shape != "line":
         spectrum = config.beam.spectrum.model_copy(update={"wavelengths": count})
         beam = config.beam.model_copy(update={"spectrum": spectrum})
-        still = {"membrane": "none", "membrane_dead_share": 0.0}  # the model's planes rest at their mean distances
+        still = {"membrane": "none", "membrane_dead_share": 0.0}  # what moves is said below
         planes = config.curvature_sensor.model_copy(update=still)
         colours = colours_of(config.model_copy(update={"beam": beam, "curvature_sensor": planes}), simulator.air)
+    sensor = config.curvature_sensor
     return SensorGeometry(
         pupil=simulator.shape,
         frame=simulator.frame,
         wavelength_m=wavelength_m(config),
         distances_m=distances_m(config),
-        flux_fractions=config.curvature_sensor.flux_fractions,
-        static_opd_m=_static_m(simulator) if config.curvature_sensor.static_rms_nm else None,
+        flux_fractions=sensor.flux_fractions,
+        static_opd_m=_static_m(simulator) if sensor.static_rms_nm else None,
         static_grid=simulator.light,
         spectrum=colours and colours.spectrum,
         colour_distances_m=colours and tuple(tuple(map(float, one)) for one in colours.distances_m),
         star=colours.star if colours else POINT,
+        motion=sensor.membrane,
+        moments=config.estimation.map.membrane_moments,
+        dead_share=sensor.membrane_dead_share,
     )
 
 

@@ -16,7 +16,7 @@ from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
-from nlcwfs.simulation.colours import refuse_colours
+from nlcwfs.simulation.colours import refuse_colours, refuse_membrane
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
@@ -67,6 +67,8 @@ class LoopLight(eqx.Module):
             SettingsError: If settings contradict each other, or the air would repeat before the end.
             SamplingError: If the pupil does not fit in the window, or the mirror's shapes are too fine for the light.
         """
+        if config.loop.sensor == "linear-curvature":
+            refuse_membrane(config, because='loop.sensor = "linear-curvature"')
         sequence = SequenceSimulator.build(sequence_config(config))
         still = sequence.still
         cut = still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]

@@ -153,6 +153,8 @@ def handed_over(config: Config, light: LoopLight) -> HandedOver:
         raise SettingsError("loop.handover", rule, "true")
     if config.feedback.controller == "kalman":
         raise SettingsError("loop.handover", "must be false with feedback.controller = kalman", "true")
+    if config.curvature_sensor.membrane == "sine":  # the matrix is that of planes at rest
+        raise SettingsError("loop.handover", 'must be false with curvature_sensor.membrane = "sine"', "true")
     return HandedOver(FollowedCurvature.build(config, light), within_range(LinearImages.build(config, light), told_m))
 
 

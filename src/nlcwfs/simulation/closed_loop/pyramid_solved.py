@@ -4,7 +4,6 @@ The matrix of the linear pyramid gives the first guess, tells from how uneven th
 and works where the most likely wavefront does not explain the light.
 """
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +16,6 @@ from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.followed_air import ExpectedAir, FollowedAir
 from nlcwfs.estimation.ladder import window_shape
-from nlcwfs.estimation.maximum_a_posteriori import TILT_VARIANCE
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS
@@ -97,11 +95,10 @@ class SearchingPyramid(eqx.Module):
         told = settings.seeing_arcsec or seeing_arcsec(still.air)
         air = expected_air(settings.prior, seeing_arcsec=told, diameter_m=diameter_m)
         power = expected_power(grid, air, wavelength_m=wave_m, cutoff_per_m=None)
-        tilt_rms_rad = math.sqrt(TILT_VARIANCE * (diameter_m / air.fried_at(wave_m)) ** (5 / 3))
         dtype = str(light.weights.dtype)
         whole = ExpectedAir(
             jnp.asarray(power, dtype),
-            jnp.asarray(tilt_rms_rad, dtype),
+            jnp.asarray(air.tilt_rms_rad(wave_m, diameter_m=diameter_m), dtype),
             grid,
             diameter_m=diameter_m,
             wavelength_m=wave_m,

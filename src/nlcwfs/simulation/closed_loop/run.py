@@ -193,16 +193,11 @@ def loop_bounds(light: LoopLight) -> dict[str, float]:
         whole.append(variance(now_m))
         fitting.append(variance(now_m - mirror.opd_m(command_m)))
         lag.append(variance(mirror.opd_m(mirror.fitted(later_m) - command_m)))
-    radian_m = still_wavelength_m(light) / (2 * math.pi)
+    radian_m = still.wavelength_m / (2 * math.pi)
     photon = mirror.count / (4 * still.photons) * radian_m**2
     squares = {"open_loop_nm": np.mean(whole), "fitting_nm": np.mean(fitting), "lag_nm": np.mean(lag)}
     squares |= {"photon_nm": photon, "floor_nm": np.mean(fitting) + np.mean(lag) + photon}
     return {name: round(1e9 * math.sqrt(square), 2) for name, square in squares.items()}
-
-
-def still_wavelength_m(light: LoopLight) -> float:
-    """Wavelength of sensing."""
-    return light.still.wavelength_m
 
 
 def _learns_at(loop: Loop, state: LoopState) -> int:
