@@ -1,8 +1,9 @@
 """What a user may choose about the maximum a posteriori reconstruction; defaults by measurement (study 02)."""
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_serializer
 
 from nlcwfs.estimation.gerchberg_saxton_settings import GerchbergSaxtonSettings
 
@@ -103,3 +104,11 @@ class MapSettings(BaseModel):
     sequence_steps: int = Field(
         default=3, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"
     )
+
+    @model_serializer(mode="wrap")
+    def _without_keys_that_do_nothing(self, write: Callable[["MapSettings"], dict[str, Any]]) -> dict[str, Any]:
+        """Keep the fingerprint of settings as it was before there were these keys."""
+        told = write(self)
+        if self.membrane_moments == 1:
+            told.pop("membrane_moments", None)
+        return told

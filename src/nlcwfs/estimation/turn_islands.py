@@ -64,8 +64,8 @@ def torn_phase(
         model = gain_counts * level.on_pixels(light[None])[0] + background
         variance = (jnp.maximum(seen, 0) + model) / 2 + noise + measured.read_variance
         factor = 1 + gain * jnp.where(usable, seen - model, 0) / (2 * variance)
-        factor = level.on_cells(jnp.clip(factor, 0, LARGEST_FACTOR)[None])[0]
-        back = jnp.sum(shares * jnp.fft.fft2(far * factor.astype(far.dtype)) * jnp.conj(transfer), axis=0)
+        factor = level.on_cells(jnp.clip(factor, 0, LARGEST_FACTOR)[None]).astype(far.dtype)
+        back = jnp.sum(jnp.fft.fft2(far * factor) * (shares.astype(far.dtype) * jnp.conj(transfer)), axis=0)
         return angle(jnp.fft.ifft2(back)), None
 
     planes = (jnp.swapaxes(moving.transfer, 0, 1), counts, measured.usable, scale.counts, scale.background, floor)
