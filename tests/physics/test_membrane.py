@@ -10,8 +10,16 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import load_config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
-from nlcwfs.curvature_sensor.membrane import membrane_moments, moments_needed
+from nlcwfs.curvature_sensor.membrane import (
+    ERROR_ALLOWED,
+    MOST_IN_A_MODEL,
+    membrane_moments,
+    moments_needed,
+    moments_of_model,
+    ripple_error,
+)
 from nlcwfs.errors import SettingsError
+from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.simulation.colours import colours_of
 from nlcwfs.simulation.exposure import ExposureSimulator
 
@@ -98,3 +106,34 @@ def test_every_colour_moves():
 def test_what_no_membrane_does_is_refused(asked, told):
     with pytest.raises(SettingsError, match=told):
         load_config(None, asked)
+
+
+@pytest.mark.parametrize("distance_m", [0.5e6, 3.5e6])
+def test_the_moments_of_a_model_miss_what_struve_s_function_says(distance_m):
+    """Gauss and Legendre's sum by hand over Kolmogorov's ripples, on another net of frequencies (2 %)."""
+    cycles = np.geomspace(1, 32, 5000)
+    turns_rad = np.pi * 0.85e-6 * distance_m * (cycles / 8) ** 2
+    true = scipy.special.struve(0, np.pi / 2 * turns_rad)
+    light = {"distance_m": distance_m, "wavelength_m": 0.85e-6, "diameter_m": 8.0}
+    errors = {}
+    for count in range(1, 17):
+        nodes, weights = scipy.special.roots_legendre(count)
+        scales = np.pi / 2 * np.sin(np.pi / 4 * (nodes + 1))
+        seen = np.sin(np.outer(turns_rad, scales)) @ weights / 2
+        power = cycles ** (-11 / 3) * cycles * cycles  # of a wave, over a ring of the plane, a step of the logarithm
+        errors[count] = np.sqrt(np.sum(power * (seen - true) ** 2) / np.sum(power * true**2))
+        assert ripple_error(count, **light) == pytest.approx(errors[count], rel=0.02, abs=1e-4)
+    needed = moments_of_model("sine", **light)
+    assert errors[needed] <= ERROR_ALLOWED < errors[needed - 1]
+    assert [moments_of_model(still, **light) for still in ("none", "square")] == [1, 1]
+
+
+def test_dead_time_leaves_fewer_moments_to_follow():
+    light = {"distance_m": 3.5e6, "wavelength_m": 0.85e-6, "diameter_m": 8.0}
+    assert moments_of_model("sine", **light, dead_share=0.6) < moments_of_model("sine", **light)
+
+
+def test_the_setting_holds_as_many_moments_as_the_rule_may_ask_for():
+    assert MapSettings(membrane_moments=MOST_IN_A_MODEL).membrane_moments == MOST_IN_A_MODEL
+    with pytest.raises(SettingsError, match=r"^estimation\.map\.membrane_moments: must be a whole number from 1 to 64"):
+        load_config(None, [f"estimation.map.membrane_moments={MOST_IN_A_MODEL + 1}"])

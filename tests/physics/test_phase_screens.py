@@ -45,6 +45,14 @@ def noll_variance(radial_order: int) -> float:
     return 8 * np.pi ** (8 / 3) * 0.0229 * (n + 1) * bessel
 
 
+def test_the_tilt_of_kolmogorov_s_air_is_noll_s():
+    """D / r0 = 8 / 0.2 at the wavelength of r0, and a colour with twice as long waves; 3 digits of Noll's table."""
+    air = Turbulence(0.2, WAVELENGTH_M)
+    expected = math.sqrt(noll_variance(1) * 40 ** (5 / 3))
+    assert air.tilt_rms_rad(WAVELENGTH_M, diameter_m=8.0) == pytest.approx(expected, rel=2e-3)
+    assert air.tilt_rms_rad(2 * WAVELENGTH_M, diameter_m=8.0) == pytest.approx(expected / 2, rel=2e-3)
+
+
 # ------------------------------------------------------------------------------------------ the spectrum
 
 

@@ -175,10 +175,9 @@ DISTANCES_M = (-2.2e6, 1.5e6, 3.1e6)
 
 
 @functools.cache
-def level(oversampling: int = 1, planes: int = 3) -> Level:
-    geometry = SensorGeometry(
-        PupilShape(8.0, obstruction_ratio=0.2), Grid((20, 22), 0.5), 0.65e-6, DISTANCES_M[:planes]
-    )
+def level(oversampling: int = 1, planes: int = 3, moments: int = 1) -> Level:
+    pupil, moving = PupilShape(8.0, obstruction_ratio=0.2), {"motion": "sine", "moments": moments}
+    geometry = SensorGeometry(pupil, Grid((20, 22), 0.5), 0.65e-6, DISTANCES_M[:planes], **moving)
     return finest_level(geometry, Turbulence(1.0), oversampling=oversampling, window=1.2, dtype="float64")
 
 
@@ -351,15 +350,16 @@ def test_the_count_of_a_try_is_that_of_the_cost_rounded_up(planes):
 
 @pytest.mark.parametrize("planes", [1, 3])
 @pytest.mark.parametrize("iterations", [1, 7])
-def test_the_count_of_tearing_is_what_the_program_holds(planes, iterations):
-    optics = level(2, planes)
+@pytest.mark.parametrize("moments", [1, 5])
+def test_the_count_of_tearing_is_what_the_program_holds(planes, iterations, moments):
+    optics = level(2, planes, moments)
     counts = jnp.ones((planes, *optics.measured_shape))
     measured = Measurement(counts, jnp.ones(counts.shape, bool), jnp.asarray(0.0))
     scale = PlaneScale(jnp.ones((planes, 1, 1)), jnp.zeros((planes, 1, 1)))
     program = jax.make_jaxpr(lambda phase: torn_phase(optics, measured, scale, phase, iterations=iterations, gain=1.0))(
         jnp.zeros(optics.grid.shape)
     )
-    assert ffts_in(program.jaxpr) == tearing_ffts(planes, iterations)
+    assert ffts_in(program.jaxpr) == tearing_ffts(planes, iterations, moments=moments)
 
 
 @pytest.mark.parametrize("inner", [2, 8])

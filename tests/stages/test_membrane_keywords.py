@@ -1,22 +1,36 @@
 """A membrane from the settings to the header of frames and to the model; who refuses it, in a line."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from astropy.io import fits
 from tests.loop.small_loop import small
 from tests.stages.command_line import small_frames, type_in
 
+from nlcwfs.commands.reconstruct_report import frame_warnings
 from nlcwfs.config import Config, digest, load_config
+from nlcwfs.curvature_sensor.membrane import moments_of_model
 from nlcwfs.errors import FileFormatError, SettingsError
 from nlcwfs.estimation.map_settings import MapSettings
+from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.interop import read_frames
+from nlcwfs.interop.frame_times import FrameTimes
+from nlcwfs.interop.frames_reconstruction import FramesReconstructor
 from nlcwfs.interop.frames_sensor import sensor_geometry
+from nlcwfs.interop.sequence_reconstruction import SequenceRun
+from nlcwfs.interop.simulated_frames import Shot, frames_of
 from nlcwfs.simulation.closed_loop.light import LoopLight
 from nlcwfs.simulation.closed_loop.sensor import build_sensor
-from nlcwfs.simulation.exposure import ExposureSimulator
+from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
 
-SINE = {"curvature_sensor__membrane": "sine", "curvature_sensor__membrane_dead_share": 0.5}
+SINE = {
+    "curvature_sensor__membrane": "sine",
+    "curvature_sensor__membrane_dead_share": 0.5,
+    "curvature_sensor__distances_km": "[-1000, 1000]",
+    "mirror__cutoff_cpa": 4,
+}
 FOLLOWED = "estimation.map.membrane_moments=6"
 HEADER = {"BUNIT": "electron", "WAVELEN": 0.85e-6, "PIXSCALE": 0.8, "TELDIAM": 8.0, "ZPLANE1": -2e6, "ZPLANE2": 2e6}
 
@@ -52,23 +66,38 @@ def test_without_a_membrane_the_header_and_the_settings_are_as_they_were(tmp_pat
     assert "membrane_moments" not in MapSettings().model_dump(mode="json")
 
 
-def test_the_loop_s_model_and_that_of_frames_are_told_the_same(simulated):
-    told = ["curvature_sensor.membrane=sine", "curvature_sensor.membrane_dead_share=0.5", FOLLOWED]
-    config = small(*told)
-    known = geometry_of(config, ExposureSimulator.build(config))
-    assert (known.motion, known.moments, known.dead_share) == ("sine", 6, 0.5)
+def test_frames_and_loops_make_the_same_model_of_the_same_sensor(tmp_path):
+    """Two colours, five moments: the light of the file's header is that of the settings."""
+    band = ("beam.spectrum.shape=flat", "beam.spectrum.bandwidth_ratio=0.2", "curvature_sensor.lenses=ideal")
+    model = ("estimation.map.membrane_moments=5", "estimation.map.wavelengths=2", "beam.spectrum.wavelengths=2")
+    sine = ("curvature_sensor.membrane=sine", "curvature_sensor.membrane_dead_share=0.2")
+    config = small(*band, *model, *sine)
+    simulator = ExposureSimulator.build(config)
+    known = geometry_of(config, simulator)
+    frames = frames_of(config, simulator, [Shot.of(simulator.expose(frame_key(seed=0, frame=0)))])
+    told = sensor_geometry(frames, wavelengths=2, moments=5)
+    ours, theirs = (one.in_colour(known.frame, dtype="float64") for one in (known, told))
+    assert ours.transfer.shape[:2] == (10, 4)
+    np.testing.assert_allclose(theirs.spectrum.shares, ours.spectrum.shares, rtol=1e-9)
+    np.testing.assert_allclose(theirs.transfer, ours.transfer, atol=1e-9)
+    assert known.in_motion(known.frame, dtype="float64").transfer.shape[:2] == (5, 4)
 
 
-def test_reconstruct_follows_the_membrane_if_it_is_asked_to(simulated, tmp_path):
-    path, _ = simulated
-    error_nm = {}
-    for name, words in {"rests": (), "moves": ("--set", FOLLOWED)}.items():
-        result = type_in("reconstruct", path, "--out", tmp_path / f"{name}.fits", *words)
-        error_nm[name] = fits.getheader(tmp_path / f"{name}.fits")["ERR_NM"]
-        warned = "MEMBRANE: the planes are taken to rest; method map follows the sine" in result.stderr
-        assert warned == (name == "rests")
-    assert result.exit_code == 0
-    assert error_nm["moves"] < 0.7 * error_nm["rests"], error_nm
+def test_reconstruct_follows_the_membrane_if_it_is_asked_to(simulated):
+    frames = read_frames(simulated[0])
+    twice = {name: np.repeat(getattr(frames, name), 2, 0) for name in ("electrons", "masked")}
+    frames = dataclasses.replace(frames, **twice, has_frame_axis=True, rate_hz=100.0)
+    light = {"distance_m": 1e6, "wavelength_m": 0.65e-6, "diameter_m": 8.0, "dead_share": 0.5}
+    needed = moments_of_model("sine", **light)
+    for moments in (1, 9):
+        settings = EstimationSettings(map=MapSettings(membrane_moments=moments))
+        single = FramesReconstructor.build(frames, settings).solver
+        movie = SequenceRun.build(frames, settings, FrameTimes(0.01, (0, 1))).solver
+        assert (single.level.moment_count, movie.solver.level.moment_count) == (moments, moments)
+        assert (movie.ffts > 500) == (moments > 1)  # of each moment as many as of one
+        warned = [one for one in frame_warnings(frames, settings) if one.startswith("MEMBRANE")]
+        rule = "the planes are taken to rest; method map follows the sine, estimation.map.membrane_moments="
+        assert warned == ([] if moments > 1 else [f"MEMBRANE: {rule}{needed}"])
 
 
 @pytest.mark.parametrize(
