@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nlcwfs.beam.colour_sampling import FINEST_RIPPLE_CPA, RIPPLES
+from nlcwfs.beam.colour_sampling import FINEST_RIPPLE_CPA
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.curvature_sensor.apparent_star import ApparentStar
 from nlcwfs.errors import SettingsError
@@ -27,6 +27,9 @@ Motion = Literal["none", "sine", "square"]
 
 ERROR_ALLOWED = 0.1
 """Of the ripples of a model's images, rms."""
+
+RIPPLES = 2000
+"""Frequencies at which ripples are looked at: at 3500 km the finest turn by less than 1 rad from one to the next."""
 
 MOST_IN_A_MODEL = 64
 """Moments that a reconstructor's model may have, see `estimation.map.membrane_moments`."""
