@@ -1,8 +1,8 @@
 """Make measured.fits, the pupil of study 15's cases `map`: uneven vanes, and mirrors that do not reflect evenly.
 
-Amplitude from 0 to 1 on 272 x 272 pixels of 30 mm: a telescope of 8 m with a shadow of 2.2 m and three vanes of 20 cm at
-uneven angles. A third of it has lost a fifth of its light, as segments do that were not washed, and smooth ripples of 10 %
-rms in amplitude lie over all.
+Amplitude from 0 to 1 on 272 x 272 pixels of 30 mm: a telescope of 8 m with a shadow of 2.2 m and three vanes of
+20 cm at uneven angles. A third of it has lost a fifth of its light, as segments do that were not washed, and smooth
+ripples of 10 % rms in amplitude lie over all.
 """
 
 from pathlib import Path
