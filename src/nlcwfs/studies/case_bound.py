@@ -10,6 +10,7 @@ from nlcwfs.beam.modes import ModalBasis, modal_basis
 from nlcwfs.config import Config
 from nlcwfs.detector.pixels import integrate_on_pixels
 from nlcwfs.estimation.photon_bound import fisher_information, photon_bound
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key, turbulence, wavelength_m
 
 SCREENS = 2
@@ -42,7 +43,7 @@ class LightInformation(NamedTuple):
 def light_information(config: Config) -> LightInformation:
     """What one photon tells about the modes; photon noise alone, so that it serves for any number of photons."""
     simulation = config.simulation.model_copy(update={"light_oversampling": OVERSAMPLING})
-    simulator = ExposureSimulator.build(config.model_copy(update={"simulation": simulation}))
+    simulator = ExposureSimulator.build(config.model_copy(update={"simulation": simulation}), pupil_of(config))
     size = simulator.light.shape[0]
     margin = (size - int(np.ceil(simulator.shape.diameter_m / simulator.light.pixel_m)) - 2) // 2
     tight = slice(margin, size - margin)
@@ -93,7 +94,8 @@ def share_on_pixels(cycles_per_aperture: float, pixel_over_diameter: float) -> f
 
 def case_bound(config: Config, light: LightInformation) -> dict[str, float]:
     """Medians over the screens, in the columns of a study's table."""
-    air, photons = turbulence(config), config.atmosphere.photons
+    air, sensor = turbulence(config), config.curvature_sensor
+    photons = config.atmosphere.photons * (1 - sensor.membrane_dead_share)
     over_fried = config.beam.diameter_m / air.fried_at(wavelength_m(config))
     found, on_pixels_m = [], []
     for per_photon in light.per_photon:
