@@ -42,6 +42,11 @@ class MapSettings(BaseModel):
         description="Wavelengths by which the model stands for light of a band; 1 takes all light for that of the "
         "wavelength of sensing, as in the paper. Each costs as much as the first.",
     )
+    star: Literal["point", "told"] = Field(
+        default="point",
+        description="whether a model of one wavelength knows the size of the star, as one of several always does: it "
+        "takes the light for that of a point, or for that of atmosphere.star",
+    )
     oversampling: int = Field(
         default=2, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
     )

@@ -12,9 +12,10 @@ from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, wavelengt
 
 
 def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
-    """What the reconstructor knows of the sensor: a static aberration, and the colours if its model has several."""
+    """What the reconstructor knows of the sensor: a static aberration, and the colours and the star if it is told."""
     count, colours = config.estimation.map.wavelengths, None
-    if count > 1 and config.beam.spectrum.shape != "line":
+    knows_star = config.estimation.map.star == "told" and config.atmosphere.star.size_mas > 0
+    if knows_star or (count > 1 and config.beam.spectrum.shape != "line"):
         spectrum = config.beam.spectrum.model_copy(update={"wavelengths": count})
         beam = config.beam.model_copy(update={"spectrum": spectrum})
         still = {"membrane": "none", "membrane_dead_share": 0.0}  # the model's planes rest at their mean distances

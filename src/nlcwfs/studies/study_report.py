@@ -35,6 +35,9 @@ COLUMNS: dict[str, dict[str, Column]] = {
     },
     "pixels": SKY
     | {
+        "star [mas]": ("star_mas", "{:g}"),
+        "dispersion [mas rms]": ("dispersion_mas", "{:.2f}"),
+        "index": ("index", "{:.3f}"),
         "screens": ("screens", "{}"),
         "captured": ("captured_pixels", "{:.1%}"),
         "median [nm]": ("median_pixels_nm", "{:.1f}"),
@@ -52,6 +55,7 @@ COLUMNS: dict[str, dict[str, Column]] = {
         ),
         "bound [nm]": ("bound_pixels_nm", "{:.1f}"),
         "quantum limit [nm]": ("quantum_pixels_nm", "{:.1f}"),
+        "added, weak / rough [nm]": (("added_weak_nm", "added_rough_nm"), "{:.1f} / {:.1f}"),
     },
     "segments": SKY
     | {
