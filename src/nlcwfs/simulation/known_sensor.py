@@ -7,7 +7,7 @@ from nlcwfs.beam.pupil import nearest_lit
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.apparent_star import POINT
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
-from nlcwfs.simulation.colours import colours_of
+from nlcwfs.simulation.colours import band_of, colours_of, lens_law
 from nlcwfs.simulation.exposure import ExposureSimulator, distances_m, wavelength_m
 
 
@@ -21,7 +21,7 @@ def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
         still = {"membrane": "none", "membrane_dead_share": 0.0}  # the model's planes rest at their mean distances
         planes = config.curvature_sensor.model_copy(update=still)
         colours = colours_of(config.model_copy(update={"beam": beam, "curvature_sensor": planes}), simulator.air)
-    return SensorGeometry(
+    geometry = SensorGeometry(
         pupil=simulator.shape,
         frame=simulator.frame,
         wavelength_m=wavelength_m(config),
@@ -33,6 +33,8 @@ def geometry_of(config: Config, simulator: ExposureSimulator) -> SensorGeometry:
         colour_distances_m=colours and tuple(tuple(map(float, one)) for one in colours.distances_m),
         star=colours.star if colours else POINT,
     )
+    band = band_of(config) if colours is None else None
+    return geometry if band is None else geometry.in_mean_phase(band, lens_law(config))
 
 
 def _static_m(simulator: ExposureSimulator) -> Float[np.ndarray, "Y X"]:
