@@ -109,7 +109,7 @@ class LightBand:
 
     @property
     def effective_m(self) -> float:
-        r"""Wavelength at which a path makes its phase on the mean over the light: :math:`1 / \langle 1 / \lambda \rangle`.
+        r"""Wavelength at which a path makes its mean phase: :math:`1 / \langle 1 / \lambda \rangle`.
 
         Examples:
             >>> band = LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)

@@ -20,7 +20,7 @@ from nlcwfs.simulation.colours import Colours
 SPECKLED = 2.0
 """Fisher information of a mode in speckles, per photon and rad^2: half of the quantum limit, 4 (docs/sensitivity)."""
 
-FREQUENCIES = 400
+FREQUENCIES = 1600
 AZIMUTHS = 33
 
 
