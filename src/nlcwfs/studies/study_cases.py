@@ -10,6 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from nlcwfs.config import Config, load_config
 from nlcwfs.errors import FileFormatError, SettingsError
 
+FigureName = Literal[
+    "convergence",
+    "photons-and-turbulence",
+    "cost",
+    "calibration",
+    "segments",
+    "sky-budgets",
+    "colours-for-lenses",
+]
+"""What there is to draw, see `study_figures`."""
+
 
 class Capture(NamedTuple):
     """When a wavefront counts as found.
@@ -75,9 +86,7 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
-    figures: tuple[
-        Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments", "sky-budgets"], ...
-    ] = ()
+    figures: tuple[FigureName, ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
     score: Literal["fine", "pixels", "segments"] = "fine"

@@ -35,6 +35,10 @@ COLUMNS: dict[str, dict[str, Column]] = {
     },
     "pixels": SKY
     | {
+        "band": ("band", "{:.0%}"),
+        "lenses": ("lenses", "{}"),
+        "wavelengths of the light": ("light_colours", "{:.0f}"),
+        "of the model": ("model_colours", "{:.0f}"),
         "star [mas]": ("star_mas", "{:g}"),
         "dispersion [mas rms]": ("dispersion_mas", "{:.2f}"),
         "index": ("index", "{:.3f}"),

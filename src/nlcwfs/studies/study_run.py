@@ -11,6 +11,7 @@ from nlcwfs.config import Config
 from nlcwfs.interop import Provenance
 from nlcwfs.studies.case_bound import LightInformation, case_bound, light_information
 from nlcwfs.studies.case_run import run_case
+from nlcwfs.studies.colour_columns import colour_columns
 from nlcwfs.studies.sky_columns import sky_columns
 from nlcwfs.studies.study_cases import Case, Study, read_study
 from nlcwfs.studies.study_light import Light, Progress, light_kind, make_light
@@ -57,7 +58,8 @@ def run_study(
             lights.clear()  # one kind at a time: memory
             lights[kind] = count, make_light(case, config, count, progress, air=study.air_of(case))
         row = run_case(case, config, study.capture, lights[kind][1].first(count), progress)
-        row |= sky_columns(config, study.air_of(case)) | _bound_columns(case, config, bounds)
+        row |= colour_columns(config) | sky_columns(config, study.air_of(case))
+        row |= _bound_columns(case, config, bounds)
         table.put({"case": case.name, "group": case.group} | row | {"commit": stamp.commit, "digest": digest}, stamp)
     if not only and table.rows:
         table.sort([case.name for case in study.case], stamp)
