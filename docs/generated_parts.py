@@ -20,6 +20,8 @@ STUDIES = (
     "09-one-family",
     "10-colour-loop",
     "11-sparse-pupil",
+    "13-no-chromatic-lenses",
+    "14-sky-budgets",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 
