@@ -120,7 +120,7 @@ def test_speckles_lose_what_the_overlap_of_two_pupils_says():
     table = np.linspace(0, DIAMETER_M, 400)
     faded = [np.average(np.cos(np.pi * size * MAS * one / WAVE_M * T), weights=strips) for one in table]
     left = np.interp(apart, table, faded)
-    kept, lost = (np.average(one**2, weights=np.maximum(pairs, 0)) for one in (left, 1 - left))
+    kept, lost = (float(np.average(one**2, weights=np.maximum(pairs, 0))) for one in (left, 1 - left))
     frequency = np.geomspace(0.5 / DIAMETER_M, 1 / PIXEL_M, 3000)
     variance = kolmogorov_rad2(frequency, 300.0)
     modes = np.pi / 4 * DIAMETER_M**2 * 2 * np.pi * frequency * np.sinc(frequency * PIXEL_M / np.sqrt(2)) ** 4
@@ -130,7 +130,7 @@ def test_speckles_lose_what_the_overlap_of_two_pupils_says():
         return float(np.trapezoid(density, frequency)) * (WAVE_M / (2 * np.pi)) ** 2
 
     speckles = (np.pi / 4 * DIAMETER_M**2 / (WAVE_M * PLANES_M)) ** 2
-    fewer = np.mean(1 / (1 + 2e5 / 4 / speckles * lost))
+    fewer = float(np.mean(1 / (1 + 2e5 / 4 / speckles * lost)))
     found = budget(f"atmosphere.star.size_mas={size}")
     for knows, photons in ((True, 2e5 * kept), (False, 2e5 * fewer)):
         expected_m = math.sqrt(error_m2(photons) - error_m2(2e5))
