@@ -1,4 +1,4 @@
-"""Closed forms of what the sky costs: against linear estimation with matrices, and pupils and stars on pixels."""
+"""Closed forms of what the sky costs: against linear estimation with matrices, and power laws."""
 
 import math
 
@@ -93,7 +93,7 @@ def test_smeared_ripples_cost_what_linear_estimation_says(effect, knows):
         assert tilt_m == pytest.approx(found.tilt_m, rel=1e-9)
         assert tilt_m > 1e-9
     # Both integrate in steps over signals that alternate fast at the end.
-    without_tilt_m = math.sqrt(found.weak_m(knows=knows) ** 2 - tilt_m**2)
+    without_tilt_m = math.sqrt(found.smeared_m(knows=knows) ** 2 - tilt_m**2)
     assert without_tilt_m == pytest.approx(ripples_m, rel=0.01)
 
 
@@ -107,34 +107,6 @@ def test_a_tilt_of_one_milliarcsecond_is_ten_nanometres_of_eight_metres():
     lit = np.hypot(y_m, x_m) < 500
     tilt_m = (mean_rad[0] * y_m + mean_rad[1] * x_m)[lit] * DIAMETER_M / 1000
     assert found.tilt_m == pytest.approx(np.std(tilt_m), rel=1e-3)  # pixels of the rim
-
-
-def test_speckles_lose_what_the_overlap_of_two_pupils_says():
-    """Pairs of points of a pupil on pixels, counted by FFT, and the visibility of a disc at each separation."""
-    size, cells = 15.0, 128
-    y, x = np.indices((4 * cells, 4 * cells)) - 2 * cells
-    pupil = (np.hypot(y, x) < cells / 2).astype(float)
-    pairs = np.fft.fftshift(np.fft.ifft2(np.abs(np.fft.fft2(pupil)) ** 2).real)
-    apart = np.hypot(y, x) * DIAMETER_M / cells
-    strips = np.sqrt(1 - T**2)
-    table = np.linspace(0, DIAMETER_M, 400)
-    faded = [np.average(np.cos(np.pi * size * MAS * one / WAVE_M * T), weights=strips) for one in table]
-    left = np.interp(apart, table, faded)
-    kept, lost = (float(np.average(one**2, weights=np.maximum(pairs, 0))) for one in (left, 1 - left))
-    frequency = np.geomspace(0.5 / DIAMETER_M, 1 / PIXEL_M, 3000)
-    variance = kolmogorov_rad2(frequency, 300.0)
-    modes = np.pi / 4 * DIAMETER_M**2 * 2 * np.pi * frequency * np.sinc(frequency * PIXEL_M / np.sqrt(2)) ** 4
-
-    def error_m2(photons: float) -> float:
-        density = modes * variance / (1 + 2 * photons * variance)
-        return float(np.trapezoid(density, frequency)) * (WAVE_M / (2 * np.pi)) ** 2
-
-    speckles = (np.pi / 4 * DIAMETER_M**2 / (WAVE_M * PLANES_M)) ** 2
-    fewer = float(np.mean(1 / (1 + 2e5 / 4 / speckles * lost)))
-    found = budget(f"atmosphere.star.size_mas={size}")
-    for knows, photons in ((True, 2e5 * kept), (False, 2e5 * fewer)):
-        expected_m = math.sqrt(error_m2(photons) - error_m2(2e5))
-        assert found.rough_m(knows=knows) == pytest.approx(expected_m, rel=0.01)  # a pupil of 128 pixels
 
 
 def test_slow_waves_of_the_amplitude_follow_their_power_law():
@@ -152,6 +124,5 @@ def test_slow_waves_of_the_amplitude_follow_their_power_law():
 def test_nothing_is_lost_to_a_steady_point():
     found = budget()
     for knows in (True, False):  # rounding, under a root
-        assert found.weak_m(knows=knows) < 1e-14
-        assert found.rough_m(knows=knows) < 1e-14
+        assert found.smeared_m(knows=knows) < 1e-14
     assert (found.tilt_m, found.dispersion_rad) == (0.0, 0.0)

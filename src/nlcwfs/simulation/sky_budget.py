@@ -1,9 +1,8 @@
 r"""What dispersion, the size of the star and its scintillation cost the wavefront of one exposure: closed forms.
 
-Light that comes from many directions smears the images: a wave of frequency f at z keeps :math:`V(z f)` of itself. Two
-limits say what that costs. A weak wavefront shows ripples, each with the signal :math:`2 \sin(\pi \lambda z f^2)` per
-radian. Behind a rough one the images are speckles, to which pairs of points of the pupil contribute as often as they
-are so far apart, and whose signal is that of any mode, on the mean over the planes.
+Light from many directions smears the images: a wave of frequency f at z keeps :math:`V(z f)` of itself. What that costs
+is told for the ripples of a weak wavefront, each with the signal :math:`2 \sin(\pi \lambda z f^2)` per radian. Study 14
+compares it with reconstructions, of weak wavefronts and of rough ones.
 """
 
 import math
@@ -16,9 +15,6 @@ from jaxtyping import Complex, Float
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.atmosphere.scintillation import amplitude_variance
 from nlcwfs.simulation.colours import Colours
-
-SPECKLED = 2.0
-"""Fisher information of a mode in speckles, per photon and rad^2: half of the quantum limit, 4 (docs/sensitivity)."""
 
 FREQUENCIES = 1600
 AZIMUTHS = 33
@@ -40,11 +36,11 @@ class SkyBudget:
         >>> from nlcwfs.config import load_config
         >>> from nlcwfs.simulation.colours import colours_of
         >>> air = Turbulence.from_rms(opd_rms_m=100e-9, diameter_m=8.0)
-        >>> colours = colours_of(load_config(None, ["atmosphere.star.size_mas=10"]), air)
+        >>> colours = colours_of(load_config(None, ["atmosphere.star.size_mas=30"]), air)
         >>> light = {"wavelength_m": 0.85e-6, "diameter_m": 8.0, "pixel_m": 0.18, "photons": 2e6}
         >>> budget = SkyBudget(air, colours, **light)
-        >>> [round(1e9 * budget.weak_m(knows=knows), 1) for knows in (False, True)]
-        [1.4, 0.6]
+        >>> [round(1e9 * budget.smeared_m(knows=knows), 1) for knows in (False, True)]
+        [2.3, 1.8]
     """
 
     air: Turbulence
@@ -54,7 +50,7 @@ class SkyBudget:
     pixel_m: float
     photons: float
 
-    def weak_m(self, *, knows: bool) -> float:
+    def smeared_m(self, *, knows: bool) -> float:
         r"""Error that smeared ripples add in quadrature.
 
         A mode of variance :math:`C`, of which N photons hold the information :math:`F = 4 N \langle s^2 \rangle`,
@@ -77,28 +73,6 @@ class SkyBudget:
             short = np.mean(np.abs(1 - believed[:, None] * faint) ** 2, axis=1)
             error = variance * short + believed * variance / (1 + seen * variance)
         return self._in_metres(modes * (error - variance / (1 + seen * variance)), tilted=not knows)
-
-    def rough_m(self, *, knows: bool) -> float:
-        r"""Error that smeared speckles add in quadrature.
-
-        The spectrum of speckles is the autocorrelation of the pupil; points s apart interfere with :math:`V(s /
-        \lambda)`, whatever the plane. A model that knows loses information by the mean of :math:`V^2`. To one that does
-        not, the mean of :math:`|1 - V|^2` is noise in each speckle, beside that of its n photons: as if there were
-        :math:`1 + n \langle |1 - V|^2 \rangle` times fewer. A plane has :math:`(\pi D^2 / 4 \lambda z)^2` speckles.
-        """
-        _, variance, modes = self._modes()
-        share = np.linspace(0, 1, FREQUENCIES + 1)[1:]
-        weight = share * (np.arccos(share) - share * np.sqrt(1 - share**2))
-        planes_m = self._planes_m()
-        baseline = np.broadcast_to(share * self.diameter_m / self.wavelength_m, (len(planes_m), len(share)))
-        left = self._fading(baseline, planes_m)
-        kept, lost = (np.average(np.mean(np.abs(one) ** 2, axis=2), axis=1, weights=weight) for one in (left, 1 - left))
-        area = math.pi / 4 * self.diameter_m**2
-        photons = self.photons / len(planes_m) * (self.wavelength_m * planes_m) ** 2 / area**2
-        information = SPECKLED * self.photons
-        told = information * np.mean(kept if knows else 1 / (1 + photons * lost))
-        error = variance / (1 + told * variance) - variance / (1 + information * variance)
-        return self._in_metres(modes * error, tilted=not knows)
 
     def twinkling_m(self, whole: Turbulence, heights_m: tuple[float, ...], fractions: tuple[float, ...]) -> float:
         r"""Error that an amplitude which the model does not know adds in quadrature, behind a rough wavefront.

@@ -1,5 +1,7 @@
 """What the rows of a study tell of dispersion, the size of the star and scintillation, and what each should cost."""
 
+import math
+
 from nlcwfs.atmosphere.scintillation import scintillation_index
 from nlcwfs.config import Config
 from nlcwfs.constants import ARCSEC_RAD
@@ -25,8 +27,8 @@ def sky_columns(config: Config, air: Config | None) -> Row:
         {}
         >>> star = ["atmosphere.opd_rms_nm=100", "atmosphere.photons=2e6", "atmosphere.star.size_mas=10"]
         >>> row = sky_columns(load_config(None, star), None)
-        >>> row["star_mas"], row["added_weak_nm"]
-        (10.0, 0.64)
+        >>> row["star_mas"], row["added_nm"]
+        (10.0, 0.83)
     """
     star, dispersed = config.atmosphere.star, config.atmosphere.dispersion.zenith_deg > 0
     if not (star.size_mas or dispersed or air):
@@ -41,7 +43,7 @@ def sky_columns(config: Config, air: Config | None) -> Row:
     )
     settings = config.estimation.map
     knows = settings.star == "told" or (settings.wavelengths > 1 and config.beam.spectrum.shape != "line")
-    weak_m, rough_m = budget.weak_m(knows=knows), budget.rough_m(knows=knows)
+    added_m = budget.smeared_m(knows=knows)
     row: Row = {}
     if star.size_mas:
         row["star_mas"] = star.size_mas
@@ -51,8 +53,8 @@ def sky_columns(config: Config, air: Config | None) -> Row:
         sky, heights_m = air.atmosphere, tuple(air.atmosphere.heights_m)
         layers = turbulence(air), heights_m, tuple(sky.layer_fractions)
         row["index"] = round(scintillation_index(*layers, wavelength_m=wavelength_m(config)), 4)
-        weak_m, rough_m = 0.0, budget.twinkling_m(*layers)
-    return row | {"added_weak_nm": round(1e9 * weak_m, 2), "added_rough_nm": round(1e9 * rough_m, 2)}
+        added_m = math.hypot(added_m, budget.twinkling_m(*layers))
+    return row | {"added_nm": round(1e9 * added_m, 2)}
 
 
 def _mas(angle_rad: float) -> float:

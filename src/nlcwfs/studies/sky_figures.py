@@ -48,8 +48,7 @@ class Curve(NamedTuple):
         measured: Median error.
         low: 16th percentile.
         high: 84th percentile.
-        weak: By the closed form of weak wavefronts.
-        rough: By that of rough ones.
+        expected: By the closed form.
         without_nm: The error without the effect.
     """
 
@@ -57,8 +56,7 @@ class Curve(NamedTuple):
     measured: Float[np.ndarray, " case"]
     low: Float[np.ndarray, " case"]
     high: Float[np.ndarray, " case"]
-    weak: Float[np.ndarray, " case"]
-    rough: Float[np.ndarray, " case"]
+    expected: Float[np.ndarray, " case"]
     without_nm: float
 
 
@@ -84,14 +82,12 @@ def curve(table: Sequence[Row], effect: str, *, rms: str, photons: str, told: bo
         return None
     without_nm = float(found[0]["median_pixels_nm"])
     errors = {name: column([*found, *rows], f"{name}_pixels_nm") / without_nm for name in ("median", "p16", "p84")}
-    added = {name: np.append(0, column(rows, f"added_{name}_nm")) / without_nm for name in ("weak", "rough")}
     return Curve(
         strength=np.append(0, column(rows, key)),
         measured=errors["median"],
         low=errors["p16"],
         high=errors["p84"],
-        weak=np.hypot(1, added["weak"]),
-        rough=np.hypot(1, added["rough"]),
+        expected=np.hypot(1, np.append(0, column(rows, "added_nm")) / without_nm),
         without_nm=without_nm,
     )
 
@@ -141,12 +137,11 @@ def _panel(panel: Axes, table: Sequence[Row], effect: str, rms: str) -> None:
         bars = np.abs(np.array([found.measured - found.low, found.high - found.measured]))
         label = f"{photons} photons, {found.without_nm:.1f} nm without"
         panel.errorbar(found.strength, found.measured, bars, fmt="o-", color=colour, label=label, markersize=4, lw=1)
-        panel.plot(found.strength, found.weak, "--", color=colour, lw=1.2)
-        panel.plot(found.strength, found.rough, ":", color=colour, lw=1.4)
+        panel.plot(found.strength, found.expected, "--", color=colour, lw=1.2)
         told = curve(table, effect, rms=rms, photons=photons, told=True)
         if told is not None:
-            shown = "o"
-            panel.plot(told.strength[1:], told.measured[1:], shown, color=colour, mfc="white", label="model is told")
+            panel.plot(told.strength[1:], told.measured[1:], "o", color=colour, mfc="white", label="model is told")
+            panel.plot(told.strength, told.expected, ":", color=colour, lw=1.4)
     panel.axhline(ALLOWED, color="gray", linewidth=0.8)
     panel.grid(alpha=0.3)
     panel.legend(fontsize=7, loc="upper left")

@@ -42,8 +42,8 @@ FIGURES: Drawings = {
     "sky-budgets": (
         draw_sky_budgets,
         "Error of the mean over each detector pixel, over that of a steady point without dispersion: median and 16 to "
-        "84 % of the skies; the gray line is a tenth more. Open: the model is told. Closed forms, added in quadrature: "
-        "dashed for ripples of a weak wavefront, dotted for the speckles of a rough one.",
+        "84 % of the skies; the gray line is a tenth more. Open: the model is told. Dashed, and dotted where it "
+        "is told: closed forms, added in quadrature.",
     ),
     "colours-for-lenses": (
         draw_colours_for_lenses,

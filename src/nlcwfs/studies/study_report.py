@@ -59,7 +59,7 @@ COLUMNS: dict[str, dict[str, Column]] = {
         ),
         "bound [nm]": ("bound_pixels_nm", "{:.1f}"),
         "quantum limit [nm]": ("quantum_pixels_nm", "{:.1f}"),
-        "added, weak / rough [nm]": (("added_weak_nm", "added_rough_nm"), "{:.1f} / {:.1f}"),
+        "closed form adds [nm]": ("added_nm", "{:.1f}"),
     },
     "segments": SKY
     | {
