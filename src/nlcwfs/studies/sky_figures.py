@@ -140,7 +140,8 @@ def _panel(panel: Axes, table: Sequence[Row], effect: str, rms: str) -> None:
         panel.plot(found.strength, found.expected, "--", color=colour, lw=1.2)
         told = curve(table, effect, rms=rms, photons=photons, told=True)
         if told is not None:
-            panel.plot(told.strength[1:], told.measured[1:], "o", color=colour, mfc="white", label="model is told")
+            label = "the model is told" if photons == "2e6" else None
+            panel.plot(told.strength[1:], told.measured[1:], "o", color=colour, mfc="white", label=label)
             panel.plot(told.strength, told.expected, ":", color=colour, lw=1.4)
     panel.axhline(ALLOWED, color="gray", linewidth=0.8)
     panel.grid(alpha=0.3)
