@@ -15,6 +15,7 @@ from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.segment_score import segment_pixels
@@ -71,12 +72,12 @@ def make_light(case: Case, config: Config, count: int, progress: Progress, *, ai
         progress: Called after each.
         air: Settings of the air whose scintillation varies the light, see `Case.twinkling`.
     """
-    simulator = ExposureSimulator.build(config)
+    simulator = ExposureSimulator.build(config, pupil_of(config))
     cut = lit_part(np.asarray(simulator.weights))
     weights = np.asarray(simulator.weights, float)[cut]
     grid = simulator.light.padded(weights.shape)
     matched = matched_model(config, simulator) if case.light == "matched" else None
-    twinkling = None if air is None else ExposureSimulator.build(air).high
+    twinkling = None if air is None else ExposureSimulator.build(air, pupil_of(air)).high
     screens = []
     for number in range(count):
         exposure = expose(simulator, frame_key(seed=config.seed, frame=number), twinkling)
