@@ -20,6 +20,8 @@ STUDIES = (
     "09-one-family",
     "10-colour-loop",
     "11-sparse-pupil",
+    "13-no-chromatic-lenses",
+    "14-sky-budgets",
     "15-any-pupil",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"

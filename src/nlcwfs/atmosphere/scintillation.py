@@ -62,3 +62,38 @@ def scintillation_index(
             found += 0.5 * 0.6 * end * 2 * np.pi * end * float(air.opd_spectrum(np.array([end]))[0])
         total += 4 * per_m**2 * fraction * float(found)
     return total
+
+
+def amplitude_variance(
+    air: Turbulence,
+    heights_m: Sequence[float],
+    fractions: Sequence[float],
+    *,
+    wavelength_m: float,
+    finest_per_m: float,
+) -> float:
+    r"""Variance of the logarithm of the amplitude, of its waves up to a frequency.
+
+    :math:`\sum_l \int W_l(f)\, \sin^2(\pi \lambda h_l f^2)\, 2 \pi f\, df` (Roddier 1981, sec. 5.2); a quarter of the
+    index of a point when all waves are counted.
+
+    Args:
+        air: The whole turbulence.
+        heights_m: Height of each layer.
+        fractions: Share of each layer in the turbulence.
+        wavelength_m: Wavelength of the light.
+        finest_per_m: Highest frequency that counts.
+
+    Examples:
+        >>> air = Turbulence.from_seeing(seeing_arcsec=0.6)
+        >>> layers = {"heights_m": (0.0, 10e3), "fractions": (0.5, 0.5), "wavelength_m": 0.85e-6}
+        >>> [round(4 * amplitude_variance(air, **layers, finest_per_m=finest), 3) for finest in (2.75, 1e3)]
+        [0.004, 0.073]
+    """
+    frequency = np.geomspace(1e-4, 1, 100001) * finest_per_m
+    power = air.opd_spectrum(frequency) * (2 * math.pi / wavelength_m) ** 2
+    total = 0.0
+    for height_m, fraction in zip(heights_m, fractions, strict=True):
+        density = power * np.sin(np.pi * wavelength_m * height_m * frequency**2) ** 2 * 2 * np.pi * frequency
+        total += fraction * float(scipy.integrate.trapezoid(density, frequency))
+    return total

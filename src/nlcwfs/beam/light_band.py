@@ -107,6 +107,17 @@ class LightBand:
         """The largest number of wavelengths that can stand for this light."""
         return max(1, min(SMOOTH_NODES, int(np.count_nonzero(self.shares)) // 2))
 
+    @property
+    def effective_m(self) -> float:
+        r"""Wavelength at which a path makes its mean phase: :math:`1 / \langle 1 / \lambda \rangle`.
+
+        Examples:
+            >>> band = LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
+            >>> round(1e6 * band.effective_m, 4), round(0.34 / np.log(1.02 / 0.68), 4)
+            (0.8385, 0.8385)
+        """
+        return float(1 / (self.shares @ (1 / self.wavelengths_m)))
+
     def spectrum(self, count: int) -> Spectrum:
         """Gauss's nodes: the few wavelengths that stand for the light best, and their shares.
 

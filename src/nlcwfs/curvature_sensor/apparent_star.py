@@ -54,7 +54,19 @@ class ApparentStar:
     def visibility(self, grid: Grid, *, distance_m: float) -> Float[np.ndarray, "y fx"]:
         """What the star's size leaves of each frequency of an image, in the order of `numpy.fft.rfft2`."""
         fx_per_m = np.fft.rfftfreq(grid.shape[1], grid.pixel_m)[None, :]
-        cycles = abs(distance_m) * self.size_rad * np.hypot(grid.fy_per_m, fx_per_m)
+        return self.fading(abs(distance_m) * np.hypot(grid.fy_per_m, fx_per_m))
+
+    def fading(self, cycles_per_rad: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        """What the star's size leaves of a wave in an image: its visibility at the baseline z f.
+
+        Args:
+            cycles_per_rad: Distance of the plane times the frequency of the wave.
+
+        Examples:
+            >>> ApparentStar(size_rad=1e-7).fading(np.array([0.0, 1.21967e7])).round(4) + 0.0  # Airy's first zero
+            array([1., 0.])
+        """
+        cycles = self.size_rad * np.asarray(cycles_per_rad, float)
         if self.profile == "gaussian":
             return np.exp(-2 * (np.pi * cycles / FWHM_IN_SIGMA) ** 2)
         angle = np.pi * np.where(cycles > 0, cycles, 1.0)

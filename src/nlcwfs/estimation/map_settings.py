@@ -50,6 +50,11 @@ class MapSettings(BaseModel):
         description="Moments by which the model follows a membrane that vibrates like a sine; 1 lets its planes "
         "rest at their mean distances. Each costs as much as the first, for each wavelength.",
     )
+    star: Literal["point", "told"] = Field(
+        default="point",
+        description="whether a model of one wavelength knows the size of the star, as one of several always does: it "
+        "takes the light for that of a point, or for that of atmosphere.star",
+    )
     oversampling: int = Field(
         default=2, ge=1, le=8, description="cells of the model per detector pixel along an axis; costs its square"
     )
@@ -108,7 +113,5 @@ class MapSettings(BaseModel):
     @model_serializer(mode="wrap")
     def _without_keys_that_do_nothing(self, write: Callable[["MapSettings"], dict[str, Any]]) -> dict[str, Any]:
         """Keep the fingerprint of settings as it was before there were these keys."""
-        told = write(self)
-        if self.membrane_moments == 1:
-            told.pop("membrane_moments", None)
-        return told
+        new = {"membrane_moments": 1, "star": "point"}
+        return {key: value for key, value in write(self).items() if key not in new or value != new[key]}

@@ -1,15 +1,17 @@
 """What a reconstructor must know of the sensor whose frames it gets."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Float
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.light_band import LightBand
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.curvature_sensor.apparent_star import POINT, ApparentStar
+from nlcwfs.curvature_sensor.chromatic_lenses import LensLaw
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.curvature_sensor.membrane import Motion, membrane_moments, moving_light
 
@@ -21,7 +23,7 @@ class SensorGeometry:
     Attributes:
         pupil: The telescope.
         frame: Pixels of one plane's frame, at the scale of the telescope.
-        wavelength_m: Wavelength of sensing.
+        wavelength_m: Wavelength of sensing, or of a model of one colour.
         distances_m: Signed distance of each plane from the pupil, positive downstream.
         flux_fractions: Share of the light of each plane; equal when left out.
         static_opd_m: Known aberration in the arm of the sensor, on the frame's pixels ...
@@ -47,6 +49,22 @@ class SensorGeometry:
     motion: Motion = "none"
     moments: int = 1
     dead_share: float = 0.0
+
+    def in_mean_phase(self, band: LightBand, law: LensLaw) -> "SensorGeometry":
+        """The same for a model of one colour of light that has many.
+
+        Behind lenses that keep distance times wavelength the images of all colours add up the phases of one path: the
+        model works at the wavelength of the mean phase, with the planes where they are for it. Behind achromatic ones
+        images differ by more than that, and the model stays where it is (docs/colour.md).
+
+        Args:
+            band: The light.
+            law: The lenses.
+        """
+        if law.kind == "achromatic":
+            return self
+        places_m = law.distances_m(self.distances_m, (band.effective_m,))[0]
+        return replace(self, wavelength_m=band.effective_m, distances_m=tuple(map(float, places_m)))
 
     def model(self, grid: Grid, *, dtype: str) -> CurvatureSensor:
         """The sensor's optics on a grid of the reconstructor."""

@@ -26,7 +26,7 @@ def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1, moments: int = 
     Args:
         frames: The file.
         wavelengths: By which a model stands for the light of its band, which is taken as flat in photons; 1 takes all
-            light for that of `WAVELEN`.
+            light for that of one, see `SensorGeometry.in_mean_phase`.
         moments: By which it follows a membrane that vibrates like a sine; 1 lets the planes rest.
 
     Examples:
@@ -52,11 +52,13 @@ def sensor_geometry(frames: FramesFile, *, wavelengths: int = 1, moments: int = 
         moments=moments,
         dead_share=frames.membrane_dead_share,
     )
-    if wavelengths == 1 or frames.bandwidth_m == 0:
+    if frames.bandwidth_m == 0:
         return geometry
     band = LightBand.flat(wavelength_m=frames.wavelength_m, bandwidth_m=frames.bandwidth_m)
-    spectrum = band.spectrum(wavelengths)
     law = LensLaw("ideal" if frames.chromatic_lenses else "achromatic", frames.wavelength_m)
+    if wavelengths == 1:
+        return geometry.in_mean_phase(band, law)
+    spectrum = band.spectrum(wavelengths)
     places_m = law.distances_m(frames.distances_m, spectrum.wavelengths_m)
     return dataclasses.replace(geometry, spectrum=spectrum, colour_distances_m=tuple(map(tuple, places_m.tolist())))
 

@@ -123,7 +123,7 @@ def colours_of(config: Config, air: Turbulence) -> Colours:
         (10, True)
     """
     band, wavelength_m = band_of(config), config.beam.wavelength_um * 1e-6
-    law = _law(config, wavelength_m if band is None else band.ends_m)
+    law = lens_law(config)
     planes_m = [distance_km * 1e3 for distance_km in config.curvature_sensor.distances_km]
     size = {"size_rad": config.atmosphere.star.size_mas * 1e-3 * ARCSEC_RAD, "profile": config.atmosphere.star.profile}
     if band is None:
@@ -247,12 +247,22 @@ def _of_doublet(law: LensLaw) -> tuple[tuple[float, ...], tuple[str, ...]]:
     return ((), ()) if law.doublet is None else (law.doublet.powers, law.doublet.glasses)
 
 
-def _law(config: Config, ends_m: float | tuple[float, float]) -> LensLaw:
-    kind, wavelength_m = config.curvature_sensor.lenses, config.beam.wavelength_um * 1e-6
-    if kind != "doublet" or not isinstance(ends_m, tuple):
+def lens_law(config: Config) -> LensLaw:
+    """The lenses of a configuration.
+
+    Raises:
+        SettingsError: If a glass cannot be used, or the band is wider than the doublet can serve.
+        FileFormatError: If a table of the spectrum cannot be read.
+
+    Examples:
+        >>> lens_law(Config()).kind
+        'achromatic'
+    """
+    kind, wavelength_m, band = config.curvature_sensor.lenses, config.beam.wavelength_um * 1e-6, band_of(config)
+    if kind != "doublet" or band is None:
         return LensLaw("achromatic" if kind == "doublet" else kind, wavelength_m)
     first, second = config.curvature_sensor.glasses
-    return LensLaw.of_glasses((first, second), wavelength_m=wavelength_m, ends_m=ends_m)
+    return LensLaw.of_glasses((first, second), wavelength_m=wavelength_m, ends_m=band.ends_m)
 
 
 def _directions_rad(config: Config, wavelengths_m: tuple[float, ...]) -> list[tuple[float, float]]:

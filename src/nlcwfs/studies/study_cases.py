@@ -10,6 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from nlcwfs.config import Config, load_config
 from nlcwfs.errors import FileFormatError, SettingsError
 
+FigureName = Literal[
+    "convergence",
+    "photons-and-turbulence",
+    "cost",
+    "calibration",
+    "segments",
+    "sky-budgets",
+    "colours-for-lenses",
+]
+"""What there is to draw, see `study_figures`."""
+
 
 class Capture(NamedTuple):
     """When a wavefront counts as found.
@@ -35,6 +46,8 @@ class Case(BaseModel):
         light: `finer` runs the light on its own grid; `matched` on the grid of the reconstructor, which flatters.
         strength: `measured` from the frames, or `known` to the reconstructor.
         bound: Whether to compute the photon bound.
+        twinkling: Settings of an air, on top of the case's own, whose scintillation varies the light, drawn apart from
+            the wavefront: what a loop sees, whose mirror takes the phase out and leaves the amplitude.
         set: Settings, as on the command line.
     """
 
@@ -47,6 +60,7 @@ class Case(BaseModel):
     light: Literal["finer", "matched"] = "finer"
     strength: Literal["measured", "known"] = "measured"
     bound: bool = False
+    twinkling: tuple[str, ...] = ()
     set: tuple[str, ...] = ()
 
 
@@ -72,7 +86,7 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
-    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments"], ...] = ()
+    figures: tuple[FigureName, ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
     score: Literal["fine", "pixels", "segments"] = "fine"
@@ -101,6 +115,14 @@ class Study(BaseModel):
         rms_nm = wavelength_nm / (2 * math.pi) * math.sqrt(1.0299 * case.telescope_over_fried ** (5 / 3))
         return load_config(None, [*self.set, *case.set, f"atmosphere.opd_rms_nm={rms_nm!r}"])
 
+    def air_of(self, case: Case) -> Config | None:
+        """The configuration of the air that makes the light of a case twinkle; None where it is steady.
+
+        Raises:
+            SettingsError: If a setting is impossible.
+        """
+        return load_config(None, [*self.set, *case.set, *case.twinkling]) if case.twinkling else None
+
     def configs(self, path: Path) -> dict[str, Config]:
         """The configuration of every case, by its name.
 
@@ -114,6 +136,7 @@ class Study(BaseModel):
         for case in self.case:
             try:
                 configs[case.name] = self.config_of(case)
+                self.air_of(case)
             except SettingsError as error:
                 where = "set" if str(error) == self._shared_problem() else f"case {case.name}"
                 reason = "; ".join(str(error).splitlines())

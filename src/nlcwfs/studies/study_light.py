@@ -7,15 +7,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PRNGKeyArray
 
+from nlcwfs.beam.air_at_pupil import HighAir
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
 from nlcwfs.interop.simulated_frames import pupil_of
-from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
+from nlcwfs.simulation.exposure import Exposure, ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.segment_score import segment_pixels
 from nlcwfs.simulation.static_aberration import lit_part
@@ -61,16 +62,25 @@ class Light(NamedTuple):
         return self._replace(screens=self.screens[:count])
 
 
-def make_light(case: Case, config: Config, count: int, progress: Progress) -> Light:
-    """Expose the detector to `count` skies."""
+def make_light(case: Case, config: Config, count: int, progress: Progress, *, air: Config | None = None) -> Light:
+    """Expose the detector to `count` skies.
+
+    Args:
+        case: Its name and kind of light.
+        config: Its settings.
+        count: Number of skies.
+        progress: Called after each.
+        air: Settings of the air whose scintillation varies the light, see `Case.twinkling`.
+    """
     simulator = ExposureSimulator.build(config, pupil_of(config))
     cut = lit_part(np.asarray(simulator.weights))
     weights = np.asarray(simulator.weights, float)[cut]
     grid = simulator.light.padded(weights.shape)
     matched = matched_model(config, simulator) if case.light == "matched" else None
+    twinkling = None if air is None else ExposureSimulator.build(air, pupil_of(air)).high
     screens = []
     for number in range(count):
-        exposure = simulator.expose(frame_key(seed=config.seed, frame=number))
+        exposure = expose(simulator, frame_key(seed=config.seed, frame=number), twinkling)
         truth_m, pixels_m = np.asarray(exposure.opd_m)[cut], np.asarray(exposure.truth_m)
         counts = np.asarray(exposure.frames.electrons)
         if matched is not None:
@@ -87,6 +97,15 @@ def make_light(case: Case, config: Config, count: int, progress: Progress) -> Li
     return Light(screens, grid, weights, np.asarray(shares, float), segment_pixels(simulator))
 
 
+def expose(simulator: ExposureSimulator, key: PRNGKeyArray, twinkling: HighAir | None) -> Exposure:
+    """An exposure; behind air that twinkles the same wavefront and the same draw of the noise, in uneven light."""
+    if twinkling is None:
+        return simulator.expose(key)
+    key_sky, key_detector = jax.random.split(key)
+    factor = jax.vmap(simulator.on_light)(twinkling.draw(jax.random.fold_in(key_sky, 1)).factor)
+    return simulator.expose_to(simulator.on_light(simulator.screens.draw(key_sky)), key_detector, factor=factor)
+
+
 def matched_model(config: Config, simulator: ExposureSimulator) -> CurvatureSensor:
     """The sensor on the grid of the reconstructor: the inverse crime, to show what it flatters."""
     return geometry_of(config, simulator).model(simulator.frame, dtype="float32")
@@ -100,4 +119,6 @@ def light_kind(case: Case, config: Config) -> str:
         >>> light_kind(one, Config()) == light_kind(other, Config()) != light_kind(one, Config(seed=1))
         True
     """
-    return json.dumps([config.model_dump(mode="json", exclude={"estimation"}), case.light], sort_keys=True)
+    return json.dumps(
+        [config.model_dump(mode="json", exclude={"estimation"}), case.light, case.twinkling], sort_keys=True
+    )

@@ -35,6 +35,13 @@ COLUMNS: dict[str, dict[str, Column]] = {
     },
     "pixels": SKY
     | {
+        "band": ("band", "{:.0%}"),
+        "lenses": ("lenses", "{}"),
+        "wavelengths of the light": ("light_colours", "{:.0f}"),
+        "of the model": ("model_colours", "{:.0f}"),
+        "star [mas]": ("star_mas", "{:g}"),
+        "dispersion [mas rms]": ("dispersion_mas", "{:.2f}"),
+        "index": ("index", "{:.3f}"),
         "screens": ("screens", "{}"),
         "captured": ("captured_pixels", "{:.1%}"),
         "median [nm]": ("median_pixels_nm", "{:.1f}"),
@@ -52,6 +59,7 @@ COLUMNS: dict[str, dict[str, Column]] = {
         ),
         "bound [nm]": ("bound_pixels_nm", "{:.1f}"),
         "quantum limit [nm]": ("quantum_pixels_nm", "{:.1f}"),
+        "closed form adds [nm]": ("added_nm", "{:.1f}"),
     },
     "segments": SKY
     | {

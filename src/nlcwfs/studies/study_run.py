@@ -11,6 +11,8 @@ from nlcwfs.config import Config
 from nlcwfs.interop import Provenance
 from nlcwfs.studies.case_bound import LightInformation, case_bound, light_information
 from nlcwfs.studies.case_run import run_case
+from nlcwfs.studies.colour_columns import colour_columns
+from nlcwfs.studies.sky_columns import sky_columns
 from nlcwfs.studies.study_cases import Case, Study, read_study
 from nlcwfs.studies.study_light import Light, Progress, light_kind, make_light
 from nlcwfs.studies.study_table import Row, StudyTable
@@ -54,8 +56,9 @@ def run_study(
         kind = light_kind(case, config)
         if kind not in lights or lights[kind][0] < count:
             lights.clear()  # one kind at a time: memory
-            lights[kind] = count, make_light(case, config, count, progress)
+            lights[kind] = count, make_light(case, config, count, progress, air=study.air_of(case))
         row = run_case(case, config, study.capture, lights[kind][1].first(count), progress)
+        row |= colour_columns(config) | sky_columns(config, study.air_of(case))
         row |= _bound_columns(case, config, bounds)
         table.put({"case": case.name, "group": case.group} | row | {"commit": stamp.commit, "digest": digest}, stamp)
     if not only and table.rows:
