@@ -55,6 +55,11 @@ class MapSettings(BaseModel):
         ge=0,
         description="stop when a step promises less than this many nats for each mode that the light shows",
     )
+    amplitude: Literal["known", "estimated"] = Field(
+        default="known",
+        description="amplitude of the light at the pupil: known, that of the telescope; or estimated beside the phase, "
+        "for scintillation, from the layers of estimation.prior.layer_heights_km",
+    )
     dark_share: float = Field(
         default=0.01,
         ge=0,
