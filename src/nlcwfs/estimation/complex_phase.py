@@ -52,12 +52,12 @@ class ComplexPhase(eqx.Module):
 
     def dot(self, a: Unknown, b: Unknown) -> Float[Array, ""]:
         """Inner product; of an unknown with itself twice its negative logarithm of the prior."""
-        return self.phase.dot(a, b)
+        product = (a.waves[1] * jnp.conj(b.waves[1])).real
+        return self.phase.dot(of_phase(a), of_phase(b)) + jnp.sum(self.phase.twice * product)
 
-    def start(self, phase: Unknown, before: Unknown | None = None) -> Unknown:
-        """A phase beside the log-amplitude of an unknown, or beside none."""
-        waves = jnp.zeros_like(phase.waves) if before is None else before.waves[1]
-        return Unknown(jnp.stack([phase.waves, waves]), phase.slope)
+    def start(self, phase: Unknown) -> Unknown:
+        """A phase in even light."""
+        return Unknown(jnp.stack([phase.waves, jnp.zeros_like(phase.waves)]), phase.slope)
 
     def preconditioner(self, information: Float[Array, ""], shown: Unknown) -> Unknown:
         """Inverse of the diagonal of the curvature of a fit; light shows both alike where it is speckled."""
@@ -67,7 +67,12 @@ class ComplexPhase(eqx.Module):
 
 
 def of_phase(unknown: Unknown) -> Unknown:
-    """The part of the phase."""
+    """The part of the phase.
+
+    Examples:
+        >>> of_phase(Unknown(jnp.ones((2, 3, 2), complex), jnp.ones(2))).waves.shape
+        (3, 2)
+    """
     return Unknown(unknown.waves[0], unknown.slope)
 
 

@@ -59,7 +59,7 @@ class ExpectedAmplitude(eqx.Module):
             power *= index / scintillation_index(air, heights_m, fractions, wavelength_m=wavelength_m)
         return cls(jnp.asarray(power, dtype), index is not None)
 
-    def root_power(self, strength: Float[Array, ""]) -> Float[Array, "y fx"]:
+    def __call__(self, strength: Float[Array, ""]) -> Float[Array, "y fx"]:
         """Root of the power of each wave, for a phase of this strength."""
         return jnp.sqrt(self.power if self.is_told else self.power * strength)
 

@@ -15,6 +15,7 @@ from nlcwfs.estimation.error_bars import ErrorBars, ModesInBands, error_bars
 from nlcwfs.estimation.map_solution import Task
 from nlcwfs.estimation.resolution_level import Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.sensor_model import mean_counts
 from nlcwfs.estimation.settings import EstimationSettings
 
 SEED = 2010
@@ -96,7 +97,7 @@ class MapError(eqx.Module):
         """
         problem, level, expected = task.problem, self.level, task.problem.expected
         if log_amplitude is not None:
-            expected = partial(lambda amplitude, phase: problem.expected(jnp.stack([phase, amplitude])), log_amplitude)
+            expected = partial(mean_counts, task.level.twinkling(log_amplitude), task.scale)
         model, along = jax.linearize(expected, phase_rad)
         bars = error_bars(
             lambda pixels: along(level.on_cells(pixels[None])[0]),

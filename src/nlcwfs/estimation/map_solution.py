@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.bayesian_unwrapping import unwrapped, unwrapping_ffts
-from nlcwfs.estimation.complex_phase import ComplexPhase
 from nlcwfs.estimation.iterate import iterate
 from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.estimation.resolution_level import LIT, Level, Measurement
@@ -79,29 +78,6 @@ class Task(NamedTuple):
     scale: PlaneScale
     beyond: Float[Array, ""]
 
-    @property
-    def known_rad(self) -> Float[Array, "y x"]:
-        """The phase that is known beforehand."""
-        known_rad = self.problem.known_rad
-        return known_rad[0] if isinstance(self.problem.prior, ComplexPhase) else known_rad
-
-    def phase_rad(self, unknown: Unknown) -> Float[Array, "y x"]:
-        """The phase of a solution, beside the known one."""
-        found_rad = self.problem.prior.phase_rad(unknown)
-        return found_rad[0] if isinstance(self.problem.prior, ComplexPhase) else found_rad
-
-    def log_amplitude(self, unknown: Unknown) -> Float[Array, "y x"] | None:
-        """The log-amplitude of a solution; None where it is taken as known."""
-        both = self.problem.prior
-        return both.phase_rad(unknown)[1] if isinstance(both, ComplexPhase) else None
-
-    def start(
-        self, phase_rad: Float[Array, "y x"], *, noise_variance: Float[Array, ""], before: Unknown | None = None
-    ) -> Unknown:
-        """The unknowns of a phase beside the known one, and of the log-amplitude of another solution."""
-        phase, both = self.prior.start(phase_rad, noise_variance=noise_variance), self.problem.prior
-        return both.start(phase, before) if isinstance(both, ComplexPhase) else phase
-
 
 class Found(NamedTuple):
     """What one exposure led to.
@@ -112,6 +88,7 @@ class Found(NamedTuple):
         slope: Starting tilt (y, x), metres per metre.
         strength: Variance of the turbulence over that of the prior.
         wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
+        log_amplitude: Of the light on the model's grid; None where it is taken as known.
     """
 
     task: Task
@@ -119,14 +96,14 @@ class Found(NamedTuple):
     slope: Float[Array, "2"]
     strength: Float[Array, ""]
     wrong_turn: Float[Array, ""] | None = None
+    log_amplitude: Float[Array, "y x"] | None = None
 
 
 def seen_modes(task: Task) -> Float[Array, ""]:
     """How many modes of the pupil the light shows better than the prior: the degrees of freedom of a fit."""
-    prior, light, both = task.prior, task.level.light, task.problem.prior
-    amplitudes = [prior.amplitude, *([both.log_amplitude] if isinstance(both, ComplexPhase) else [])]
-    gains = [task.problem.information * amplitude**2 for amplitude in amplitudes]
-    return jnp.sum(light) / light.size * sum(jnp.sum(prior.twice * gain / (1 + gain)) for gain in gains)
+    prior, light = task.prior, task.level.light
+    gain = task.problem.information * prior.amplitude**2
+    return jnp.sum(light) / light.size * jnp.sum(prior.twice * gain / (1 + gain))
 
 
 def solved(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[Array, Array]) -> Solution:
@@ -192,17 +169,18 @@ def likelier(tried: Solution, best: Solution) -> Solution:
 
 def healed(task: Task, settings: MapSettings, solution: Solution) -> Solution:
     """Another solution, from the same light without the islands, see `turn_islands`."""
-    problem, log_amplitude = task.problem, task.log_amplitude(solution.unknown)
+    problem, level = task.problem, task.level
+    phase_rad = problem.known_rad + problem.prior.phase_rad(solution.unknown)
     torn_rad = torn_phase(
-        task.level if log_amplitude is None else task.level.twinkling(log_amplitude),
+        level,
         task.measured,
         task.scale,
-        task.known_rad + task.phase_rad(solution.unknown),
+        phase_rad,
         iterations=settings.healing_iterations,
         gain=settings.healing_gain,
     )
-    whole_rad = unwrapped(torn_rad - task.known_rad, task.level.light > LIT, task.prior)
-    start = task.start(whole_rad, noise_variance=1 / problem.information, before=solution.unknown)
+    whole_rad = unwrapped(torn_rad - problem.known_rad, level.light > LIT, task.prior)
+    start = task.prior.start(whole_rad, noise_variance=1 / problem.information)
     ffts = tearing_ffts(problem.counts.shape[0], settings.healing_iterations) + unwrapping_ffts() + 1
     return solved(task, settings, start, (solution.steps, solution.ffts + ffts))
 
@@ -225,7 +203,7 @@ def misfit(task: Task, model: Float[Array, "plane v u"]) -> Float[Array, ""]:
 
 def disagreement_rad(task: Task, a: Unknown, b: Unknown) -> Float[Array, ""]:
     """Rms over the pupil of the difference of two solutions, piston excluded."""
-    difference = task.phase_rad(a) - task.phase_rad(b)
+    difference = task.problem.prior.phase_rad(a) - task.problem.prior.phase_rad(b)
     if task.prior.steps is not None:  # its whole turns no colour tells, or are looked for when all else is found
         turns = task.prior.steps.means(difference) / (2 * jnp.pi)
         difference = difference - 2 * jnp.pi * jnp.round(turns - turns.ravel()[jnp.argmax(task.level.weight)])

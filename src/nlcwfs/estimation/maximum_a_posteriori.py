@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.estimation import gauss_newton as gn
-from nlcwfs.estimation.complex_phase import ComplexPhase
+from nlcwfs.estimation.amplitude_search import with_amplitude
 from nlcwfs.estimation.expected_amplitude import ExpectedAmplitude
 from nlcwfs.estimation.first_guess import segmented_start, with_strength
 from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share
@@ -175,7 +175,10 @@ class MaximumAPosteriori(eqx.Module):
         task, unknown = self.prepared(near, slope, climb, mirror_rad)
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
         search, wrong_turn = with_turns(task, self.settings, search)
-        return Found(task, search, slope, climb.strength, wrong_turn)
+        log_amplitude = None
+        if self.amplitude is not None:
+            search, log_amplitude = with_amplitude(task, self.settings.map, search, self.amplitude(climb.strength))
+        return Found(task, search, slope, climb.strength, wrong_turn, log_amplitude)
 
     def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """A phase of the model's grid on that of the first guess."""
@@ -204,7 +207,7 @@ class MaximumAPosteriori(eqx.Module):
         scale = self.plane_scale(measured, known_rad + phase_rad)
         prior = self.prior(self.power * climb.strength, self.tilt_rms_rad * jnp.sqrt(climb.strength))
         task = self.task(measured, known_rad, scale, prior, climb.strength)
-        return task, task.start(phase_rad, noise_variance=START_NOISE / task.problem.information)
+        return task, prior.start(phase_rad, noise_variance=START_NOISE / task.problem.information)
 
     def known_rad(self, slope: Float[Array, "2"]) -> Float[Array, "y x"]:
         """The phase of a tilt and of the static aberration."""
@@ -234,11 +237,7 @@ class MaximumAPosteriori(eqx.Module):
         strength: Float[Array, ""],
     ) -> Task:
         """What is to be solved for one exposure."""
-        both = prior
-        if self.amplitude is not None:
-            both = ComplexPhase(prior, self.amplitude.root_power(strength))
-            known_rad = jnp.stack([known_rad, jnp.zeros_like(known_rad)])
-        problem = self.problem(measured, known_rad, scale, both)
+        problem = self.problem(measured, known_rad, scale, prior)
         return Task(problem, prior, self.level, measured, scale, self.beyond_cells * strength)
 
     def problem(
@@ -263,15 +262,15 @@ class MaximumAPosteriori(eqx.Module):
         """Wavefront, error bars and verdict of the best solution."""
         task, best, strength = found.task, found.search.best, found.strength
         metres = self.geometry.wavelength_m / (2 * np.pi)
-        phase_rad, log_amplitude = task.known_rad + task.phase_rad(best.unknown), task.log_amplitude(best.unknown)
+        phase_rad = task.problem.known_rad + task.problem.prior.phase_rad(best.unknown)
         opd_m = self.on_frame(phase_rad) * metres - self.on_frame(self.level.optics.static_opd_m)
-        opd_m = self.without_mean(opd_m)
+        opd_m = self.levelled(opd_m)
         measured, shape = task.measured, self.geometry.frame.shape
         unexplained = unexplained_share(measured, best.model, self.band)
         code = map_verdict(
             found.search, unexplained=unexplained, measured=measured, finite=jnp.all(jnp.isfinite(opd_m))
         )
-        bars = self.error.bars(task, phase_rad, strength, log_amplitude)
+        bars = self.error.bars(task, phase_rad, strength, found.log_amplitude)
         believed = (code == Outcome.CONVERGED) | (code == Outcome.BUDGET_SPENT)
         told = self.error.told_rad(bars, strength, believed) * metres
         residual = jnp.where(measured.usable, measured.counts - best.model, 0)
@@ -286,10 +285,10 @@ class MaximumAPosteriori(eqx.Module):
             strength=strength,
             error_bars=bars,
             wrong_turn=found.wrong_turn,
-            log_amplitude=None if log_amplitude is None else self.without_mean(self.on_frame(log_amplitude)),
+            log_amplitude=None if found.log_amplitude is None else self.levelled(self.on_frame(found.log_amplitude)),
         )
 
-    def without_mean(self, on_frame: Float[Array, "v u"]) -> Float[Array, "v u"]:
+    def levelled(self, on_frame: Float[Array, "v u"]) -> Float[Array, "v u"]:
         """A map on the pixels of the frames without its mean over the light."""
         light = self.on_frame(self.level.light)
         return on_frame - jnp.sum(light * on_frame) / jnp.sum(light)
