@@ -183,6 +183,7 @@ def errors(amplitude: str, photons: float) -> np.ndarray:
 SOLVERS = {name: solver(name) for name in ("known", "estimated")}
 
 
+@pytest.mark.slow
 def test_with_much_light_the_amplitude_is_found_and_the_phase_is_better():
     joint, even = errors("estimated", 2e6), errors("known", 2e6)
     # found: 2.6 to 3.7 nm in place of 14 to 19, 0.15 of the amplitude missed
@@ -191,6 +192,7 @@ def test_with_much_light_the_amplitude_is_found_and_the_phase_is_better():
     assert np.all(joint[:, 2] > 0.97)
 
 
+@pytest.mark.slow
 def test_with_little_light_it_does_not_hurt():
     joint, even = errors("estimated", 2e3), errors("known", 2e3)
     assert np.all(joint[:, 0] < 1.02 * even[:, 0])  # found: 0.83 to 0.94

@@ -29,7 +29,7 @@ def with_amplitude(
     problem = task.problem._replace(
         expected=lambda both: mean_counts(task.level, task.scale, both), known_rad=known_rad, prior=prior
     )
-    best = search.best
+    best, settings = search.best, settings.model_copy(update={"steps": settings.amplitude_steps})
     found = solved(task._replace(problem=problem), settings, prior.start(best.unknown), (best.steps, best.ffts))
     log_amplitude = prior.phase_rad(found.unknown)[1]
     return search._replace(best=found._replace(unknown=of_phase(found.unknown))), log_amplitude

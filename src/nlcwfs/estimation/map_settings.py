@@ -60,6 +60,9 @@ class MapSettings(BaseModel):
         description="amplitude of the light at the pupil: known, that of the telescope; or estimated beside the phase, "
         "for scintillation, from the layers of estimation.prior.layer_heights_km",
     )
+    amplitude_steps: int = Field(
+        default=9, ge=1, le=1000, description="most Gauss-Newton steps with the amplitude free, after those without"
+    )
     dark_share: float = Field(
         default=0.01,
         ge=0,
