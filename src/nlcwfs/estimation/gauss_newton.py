@@ -19,13 +19,13 @@ SHORTER = 0.4
 
 @runtime_checkable
 class Prior(Protocol):
-    """What is expected of a phase: unknowns of unit variance, see `WhitenedPhase`."""
+    """What is expected of a phase, or of a `ComplexPhase`: unknowns of unit variance, see `WhitenedPhase`."""
 
-    def phase_rad(self, unknown: Unknown) -> Float[Array, "y x"]:
-        """The phase of these unknowns."""
+    def phase_rad(self, unknown: Unknown) -> Float[Array, "*both y x"]:
+        """The phase of these unknowns, or phase and log-amplitude."""
         ...
 
-    def transposed(self, gradient: Float[Array, "y x"]) -> Unknown:
+    def transposed(self, gradient: Float[Array, "*both y x"]) -> Unknown:
         """The transpose of `phase_rad`."""
         ...
 
@@ -52,11 +52,11 @@ class Problem(NamedTuple):
         shown: What each unknown has of that, see `wave_sensitivity`; 1 in speckled light.
     """
 
-    expected: Callable[[Float[Array, "y x"]], Float[Array, "plane v u"]]
+    expected: Callable[[Float[Array, "*both y x"]], Float[Array, "plane v u"]]
     counts: Float[Array, "plane v u"]
     usable: Bool[Array, "plane v u"]
     dark: Float[Array, "plane 1 1"]
-    known_rad: Float[Array, "y x"]
+    known_rad: Float[Array, "*both y x"]
     prior: Prior
     information: Float[Array, ""]
     shown: Unknown

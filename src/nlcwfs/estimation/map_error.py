@@ -1,5 +1,7 @@
 """Error bars of a maximum a posteriori wavefront."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from nlcwfs.estimation.error_bars import ErrorBars, ModesInBands, error_bars
 from nlcwfs.estimation.map_solution import Task
 from nlcwfs.estimation.resolution_level import Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
+from nlcwfs.estimation.sensor_model import mean_counts
 from nlcwfs.estimation.settings import EstimationSettings
 
 SEED = 2010
@@ -81,10 +84,21 @@ class MapError(eqx.Module):
             unseen=jnp.asarray(UNSEEN_SLOW / (1 + (cycles / UNSEEN_HALF_CPA) ** 2), dtype),
         )
 
-    def bars(self, task: Task, phase_rad: Float[Array, "y x"], strength: Float[Array, ""]) -> ErrorBars:
-        """Error of every mode of the wavefront's mean over pixels; the phase is on the model's grid, and whole."""
-        problem, level = task.problem, self.level
-        model, along = jax.linearize(problem.expected, phase_rad)
+    def bars(
+        self,
+        task: Task,
+        phase_rad: Float[Array, "y x"],
+        strength: Float[Array, ""],
+        log_amplitude: Float[Array, "y x"] | None = None,
+    ) -> ErrorBars:
+        """Error of every mode of the wavefront's mean over pixels; the phase is on the model's grid, and whole.
+
+        Of an amplitude that is estimated too it takes no account: what one takes from the other is not counted.
+        """
+        problem, level, expected = task.problem, self.level, task.problem.expected
+        if log_amplitude is not None:
+            expected = partial(mean_counts, task.level.twinkling(log_amplitude), task.scale)
+        model, along = jax.linearize(expected, phase_rad)
         bars = error_bars(
             lambda pixels: along(level.on_cells(pixels[None])[0]),
             jnp.where(problem.usable, model + problem.dark, jnp.inf),

@@ -68,6 +68,14 @@ class MapSettings(BaseModel):
         ge=0,
         description="stop when a step promises less than this many nats for each mode that the light shows",
     )
+    amplitude: Literal["known", "estimated"] = Field(
+        default="known",
+        description="amplitude of the light at the pupil: known, that of the telescope; or estimated beside the phase, "
+        "for scintillation, from the layers of estimation.prior.layer_heights_km",
+    )
+    amplitude_steps: int = Field(
+        default=9, ge=1, le=1000, description="most Gauss-Newton steps with the amplitude free, after those without"
+    )
     dark_share: float = Field(
         default=0.01,
         ge=0,
@@ -113,5 +121,5 @@ class MapSettings(BaseModel):
     @model_serializer(mode="wrap")
     def _without_keys_that_do_nothing(self, write: Callable[["MapSettings"], dict[str, Any]]) -> dict[str, Any]:
         """Keep the fingerprint of settings as it was before there were these keys."""
-        new = {"membrane_moments": 1, "star": "point"}
+        new = {"membrane_moments": 1, "star": "point", "amplitude": "known"}
         return {key: value for key, value in write(self).items() if key not in new or value != new[key]}

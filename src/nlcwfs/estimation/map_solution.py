@@ -88,6 +88,7 @@ class Found(NamedTuple):
         slope: Starting tilt (y, x), metres per metre.
         strength: Variance of the turbulence over that of the prior.
         wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
+        log_amplitude: Of the light on the model's grid; None where it is taken as known.
     """
 
     task: Task
@@ -95,6 +96,7 @@ class Found(NamedTuple):
     slope: Float[Array, "2"]
     strength: Float[Array, ""]
     wrong_turn: Float[Array, ""] | None = None
+    log_amplitude: Float[Array, "y x"] | None = None
 
 
 def seen_modes(task: Task) -> Float[Array, ""]:

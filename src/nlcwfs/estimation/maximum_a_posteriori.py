@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -11,6 +10,8 @@ from jaxtyping import Array, Bool, Float
 from nlcwfs.beam.grid import Grid
 from nlcwfs.constants import ARCSEC_RAD, SEEING_TO_FRIED, SEEING_WAVELENGTH_M
 from nlcwfs.estimation import gauss_newton as gn
+from nlcwfs.estimation.amplitude_search import with_amplitude
+from nlcwfs.estimation.expected_amplitude import ExpectedAmplitude
 from nlcwfs.estimation.first_guess import segmented_start, with_strength
 from nlcwfs.estimation.fit_quality import speckle_band, unexplained_share
 from nlcwfs.estimation.gerchberg_saxton import phase_noise
@@ -21,7 +22,7 @@ from nlcwfs.estimation.map_verdict import map_verdict
 from nlcwfs.estimation.outcome import Outcome
 from nlcwfs.estimation.phase_prior import expected_air, prior_power
 from nlcwfs.estimation.reconstructor import SENSOR_LOSS, TYPICAL_SEEING_ARCSEC, Climb, GerchbergSaxton
-from nlcwfs.estimation.resolution_level import Level, Measurement, cropped, pixel_means
+from nlcwfs.estimation.resolution_level import Level, Measurement, continued, cropped, pixel_means
 from nlcwfs.estimation.segment_steps import SegmentSteps, steps_of
 from nlcwfs.estimation.segment_turns import with_turns
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
@@ -53,6 +54,7 @@ class MaximumAPosteriori(eqx.Module):
         band: See `speckle_band`.
         error: Tells the error bars.
         steps: Of the segments of the pupil; None for a pupil of one piece.
+        amplitude: What is expected of the amplitude where it is estimated, else None.
 
     Examples:
         >>> from nlcwfs.beam.pupil_shape import PupilShape
@@ -76,6 +78,7 @@ class MaximumAPosteriori(eqx.Module):
     band: Float[Array, "v fu"]
     error: MapError
     steps: SegmentSteps | None
+    amplitude: ExpectedAmplitude | None
     settings: EstimationSettings = eqx.field(static=True)
     geometry: SensorGeometry = eqx.field(static=True)
 
@@ -124,6 +127,7 @@ class MaximumAPosteriori(eqx.Module):
             ),
             error=MapError.build(geometry, settings, level, air, dtype=dtype),
             steps=steps,
+            amplitude=ExpectedAmplitude.build(geometry, settings, level, air, dtype=dtype),
             settings=settings,
             geometry=geometry,
         )
@@ -147,8 +151,7 @@ class MaximumAPosteriori(eqx.Module):
         Returns:
             The estimate on the frames' pixels.
         """
-        found = self.found(self.capture.measurement(counts, usable, read_variance), start_m)
-        return self.account(found)
+        return self.account(self.found(self.capture.measurement(counts, usable, read_variance), start_m))
 
     def found(
         self,
@@ -167,7 +170,10 @@ class MaximumAPosteriori(eqx.Module):
         task, unknown = self.prepared(near, slope, climb, mirror_rad)
         search = searched(task, self.settings.map, unknown, (climb.iterations, climb.ffts))
         search, wrong_turn = with_turns(task, self.settings, search)
-        return Found(task, search, slope, climb.strength, wrong_turn)
+        log_amplitude = None
+        if self.amplitude is not None:
+            search, log_amplitude = with_amplitude(task, self.settings.map, search, self.amplitude(climb.strength))
+        return Found(task, search, slope, climb.strength, wrong_turn, log_amplitude)
 
     def on_capture(self, phase_rad: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """A phase of the model's grid on that of the first guess."""
@@ -178,18 +184,8 @@ class MaximumAPosteriori(eqx.Module):
         """The first guess of a field, unwrapped segment by segment on the model's grid, and the strength it shows."""
         prior = self.prior(self.power * climb.strength, self.tilt_rms_rad * jnp.sqrt(climb.strength))
         noise = SENSOR_LOSS * phase_noise(self.level, near)
-        wrapped_rad = self.on_model(climb.phase_rad, near)
+        wrapped_rad = continued(self.level, climb.phase_rad, near)
         return segmented_start(self.level, prior, climb, wrapped_rad, noise, learns=self.capture.measures_strength)
-
-    def on_model(self, phase_rad: Float[Array, "y x"], near: Measurement) -> Float[Array, "v u"]:
-        """The first guess on the grid of the model, going on as it ends beyond the frames."""
-        level = self.level
-        if phase_rad.shape == level.grid.shape:
-            return phase_rad
-        fine = [size * level.oversampling for size in near.counts.shape[1:]]
-        phase_rad = jax.image.resize(phase_rad, fine, method="cubic").astype(phase_rad.dtype)
-        margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
-        return jnp.pad(phase_rad, margins, mode="edge")
 
     def prepared(
         self,
@@ -200,7 +196,7 @@ class MaximumAPosteriori(eqx.Module):
     ) -> tuple[Task, Unknown]:
         """The task of one exposure and the first guess, on the grid of the model."""
         level = self.level
-        phase_rad = self.on_model(climb.phase_rad, near)
+        phase_rad = continued(level, climb.phase_rad, near)
         measured = near.padded(level.measured_shape)
         known_rad = self.known_rad(slope) - (0 if mirror_rad is None else mirror_rad)
         scale = self.plane_scale(measured, known_rad + phase_rad)
@@ -263,14 +259,13 @@ class MaximumAPosteriori(eqx.Module):
         metres = self.geometry.wavelength_m / (2 * np.pi)
         phase_rad = task.problem.known_rad + task.problem.prior.phase_rad(best.unknown)
         opd_m = self.on_frame(phase_rad) * metres - self.on_frame(self.level.optics.static_opd_m)
-        light = self.on_frame(self.level.light)
-        opd_m = opd_m - jnp.sum(light * opd_m) / jnp.sum(light)
+        opd_m = self.levelled(opd_m)
         measured, shape = task.measured, self.geometry.frame.shape
         unexplained = unexplained_share(measured, best.model, self.band)
         code = map_verdict(
             found.search, unexplained=unexplained, measured=measured, finite=jnp.all(jnp.isfinite(opd_m))
         )
-        bars = self.error.bars(task, phase_rad, strength)
+        bars = self.error.bars(task, phase_rad, strength, found.log_amplitude)
         believed = (code == Outcome.CONVERGED) | (code == Outcome.BUDGET_SPENT)
         told = self.error.told_rad(bars, strength, believed) * metres
         residual = jnp.where(measured.usable, measured.counts - best.model, 0)
@@ -285,7 +280,13 @@ class MaximumAPosteriori(eqx.Module):
             strength=strength,
             error_bars=bars,
             wrong_turn=found.wrong_turn,
+            log_amplitude=None if found.log_amplitude is None else self.levelled(self.on_frame(found.log_amplitude)),
         )
+
+    def levelled(self, on_frame: Float[Array, "v u"]) -> Float[Array, "v u"]:
+        """A map on the pixels of the frames without its mean over the light."""
+        light = self.on_frame(self.level.light)
+        return on_frame - jnp.sum(light * on_frame) / jnp.sum(light)
 
     def on_frame(self, array: Float[Array, "y x"]) -> Float[Array, "v u"]:
         """From the model's grid to the pixels of the frames: the mean over each."""

@@ -1,6 +1,7 @@
 """The reconstructor that the settings ask for."""
 
 from nlcwfs.beam.modes import ModalBasis
+from nlcwfs.estimation.expected_amplitude import refuse_estimated
 from nlcwfs.estimation.linear_reconstructor import LinearReconstructor
 from nlcwfs.estimation.maximum_a_posteriori import MaximumAPosteriori
 from nlcwfs.estimation.reconstructor import GerchbergSaxton
@@ -35,6 +36,7 @@ def build_reconstructor(
     """
     if settings.method == "map":
         return MaximumAPosteriori.build(geometry, settings, dtype=dtype)
+    refuse_estimated(settings, because=f"estimation.method = {settings.method}")
     if settings.method == "linear":
         return LinearReconstructor.build(geometry, settings, linear=settings.linear, dtype=dtype)
     return GerchbergSaxton.build(geometry, settings, basis=basis, dtype=dtype)

@@ -1,5 +1,7 @@
 """What a user may tell about the phase before a photon is seen: the air, and the loop that flattens it."""
 
+from typing import Annotated
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -55,6 +57,27 @@ class PriorSettings(BaseModel):
     )
     beyond_share: float = Field(
         default=1.0, gt=0, le=1, description="share of the turbulence that is expected beyond the mirror's cutoff"
+    )
+    layer_heights_km: tuple[Annotated[float, Field(ge=0)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        examples=[(0.0, 10.0)],
+        description="height of each layer of the air above the telescope along the line of sight, for "
+        "estimation.map.amplitude = estimated",
+    )
+    layer_fractions: tuple[Annotated[float, Field(ge=0)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        examples=[(0.5, 0.5)],
+        description="share of each layer in the turbulence, sum 1; leave out for equal shares",
+    )
+    scintillation_index: float | None = Field(
+        default=None,
+        gt=0,
+        le=0.3,
+        examples=[0.07],
+        description="variance of the light of a point of the pupil over its mean squared; leave out where it is "
+        "that of the turbulence that the phase shows",
     )
     segment_piston_nm: float = Field(
         default=1000.0, ge=0, description="rms piston of the segments of a pupil that is expected beside the air"

@@ -1,5 +1,7 @@
 """One resolution of the coarse-to-fine ladder: the sensor on a grid, and the counts on it."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -122,6 +124,14 @@ class Level(eqx.Module):
         """Whether the model's light has several wavelengths."""
         return self.colours is not None and len(set(self.colours.spectrum.wavelengths_m)) > 1
 
+    def twinkling(self, log_amplitude: Float[Array, "y x"]) -> "Level":
+        """The sensor with an amplitude at the pupil that varies; the light has unit power as before."""
+        factor, colours = jnp.exp(log_amplitude), self.colours
+        modulus = self.modulus * factor
+        if colours is not None:  # one amplitude for all: to first order it does not depend on the wavelength
+            colours = dataclasses.replace(colours, pupil=colours.pupil * factor)
+        return dataclasses.replace(self, modulus=modulus / jnp.sqrt(jnp.sum(modulus**2)), colours=colours)
+
     def on_pixels(self, photons: Float[Array, "plane y x"]) -> Float[Array, "plane v u"]:
         """What the measured pixels see of light on the model's grid."""
         return sum_blocks(photons, self.oversampling)
@@ -145,6 +155,16 @@ def sum_blocks(array: Float[Array, "plane y x"], factor: int) -> Float[Array, "p
 def pixel_means(array: Float[Array, "y x"], factor: int, shape: tuple[int, int]) -> Float[Array, "v u"]:
     """Mean over squares of `factor` x `factor` cells, of the middle of an array."""
     return cropped(sum_blocks(array[None], factor)[0] / factor**2, shape)
+
+
+def continued(level: Level, phase_rad: Float[Array, "y x"], near: Measurement) -> Float[Array, "v u"]:
+    """A phase on the window of the frames, on the grid of a level: beyond the frames it goes on as it ends."""
+    if phase_rad.shape == level.grid.shape:
+        return phase_rad
+    fine = [size * level.oversampling for size in near.counts.shape[1:]]
+    phase_rad = jax.image.resize(phase_rad, fine, method="cubic").astype(phase_rad.dtype)
+    margins = [((a - b) // 2, (a - b) // 2) for a, b in zip(level.grid.shape, fine, strict=True)]
+    return jnp.pad(phase_rad, margins, mode="edge")
 
 
 def cropped(array: Float[Array, "y x"], shape: tuple[int, int]) -> Float[Array, "v u"]:

@@ -74,6 +74,8 @@ def plane_scale(
     return PlaneScale(gain, background)
 
 
-def mean_counts(level: Level, scale: PlaneScale, phase_rad: Float[Array, "y x"]) -> Float[Array, "plane v u"]:
-    """What the measured pixels count on average."""
+def mean_counts(level: Level, scale: PlaneScale, phase_rad: Float[Array, "*both y x"]) -> Float[Array, "plane v u"]:
+    """What the measured pixels count on average, for a phase, or for a `ComplexPhase`."""
+    if phase_rad.ndim == 3:
+        level, phase_rad = level.twinkling(phase_rad[1]), phase_rad[0]
     return scale.counts * light_on_pixels(level, phase_rad) + scale.background

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation import gauss_newton as gn
+from nlcwfs.estimation.expected_amplitude import refuse_estimated
 from nlcwfs.estimation.fit_quality import unexplained_share
 from nlcwfs.estimation.followed_air import ExpectedAir, FollowedAir
 from nlcwfs.estimation.map_solution import Found, Task
@@ -86,6 +87,7 @@ class SequenceReconstructor(eqx.Module):
         if geometry.pupil.is_segmented:
             rule = "must be one piece to be followed from frame to frame; frames on their own may have segments"
             raise SettingsError("pupil", rule, "segments")
+        refuse_estimated(settings, because="frames that follow each other: only frames on their own twinkle")
         planes, options, prior = len(geometry.distances_m), settings.map, settings.prior
         inner = inner_steps(
             planes,

@@ -22,6 +22,8 @@ class WavefrontEstimate(eqx.Module):
         strength: Variance of the turbulence over that of 0.6" seeing, as given or as measured.
         error_bars: Error of every mode; None where the method tells none.
         wrong_turn: Probability that a segment of the pupil is whole wavelengths off; None where nothing tells.
+        log_amplitude: Logarithm of the light's amplitude at the pupil over that of the telescope, on the frames'
+            pixels, zero mean over the light; None where the amplitude is taken as known.
     """
 
     opd_m: Float[Array, "*frame y x"]
@@ -34,6 +36,7 @@ class WavefrontEstimate(eqx.Module):
     strength: Float[Array, "*frame"]
     error_bars: ErrorBars | None = None
     wrong_turn: Float[Array, "*frame"] | None = None
+    log_amplitude: Float[Array, "*frame y x"] | None = None
 
     @property
     def outcome(self) -> Outcome:

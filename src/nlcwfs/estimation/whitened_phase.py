@@ -20,11 +20,12 @@ class Unknown(NamedTuple):
     """A phase in units of what the prior expects; each real number in it has unit variance.
 
     Attributes:
-        waves: Half-plane of Fourier coefficients (`rfft2`, orthonormal); or, of a `ModalPrior`, real unknowns.
+        waves: Half-plane of Fourier coefficients (`rfft2`, orthonormal), of a `ComplexPhase` two, of phase and
+            log-amplitude; or, of a `ModalPrior`, real unknowns.
         slope: Tilt along y and x: a window that repeats itself cannot hold one. Then the steps of a segmented pupil.
     """
 
-    waves: Complex[Array, "y fx"] | Float[Array, " unknown"]
+    waves: Complex[Array, "*both y fx"] | Float[Array, " unknown"]
     slope: Float[Array, " ramp"]
 
 

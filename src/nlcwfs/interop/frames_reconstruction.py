@@ -157,6 +157,7 @@ class FramesReconstructor(eqx.Module):
         if truth_m is not None:
             truth_m = truth_m if truth_m.ndim == 2 else truth_m[number]
         residual = np.where(self.frames.masked[number], np.nan, np.asarray(estimate.residual, float))
+        log_amplitude = None if estimate.log_amplitude is None else np.asarray(estimate.log_amplitude, float)
         bars = estimate.error_bars if estimate.outcome.succeeded else None
         limit_nm = loss = None
         if self.report is not None and bars is not None:
@@ -176,6 +177,7 @@ class FramesReconstructor(eqx.Module):
             photon_loss=loss,
             wrong_turn=None if estimate.wrong_turn is None else float(estimate.wrong_turn),
             residual=residual,
+            amplitude=None if log_amplitude is None else np.where(self.weights > 0, np.exp(log_amplitude), np.nan),
             sentence=estimate.outcome.sentence,
         )
 

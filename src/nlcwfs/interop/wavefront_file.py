@@ -36,6 +36,7 @@ class FrameWavefront:
         photon_loss: Photons that the sensor needs relative to that limit; None when the method tells none.
         wrong_turn: Probability that a segment is whole wavelengths off; None where nothing tells.
         residual: Data - model in electrons.
+        amplitude: Of the light over that of the telescope, NaN outside the pupil; None where it was taken as known.
         sentence: What the outcome means here.
     """
 
@@ -53,6 +54,7 @@ class FrameWavefront:
     photon_loss: float | None = None
     wrong_turn: float | None = None
     residual: Float[np.ndarray, "plane y x"] | None = None
+    amplitude: Float[np.ndarray, "y x"] | None = None
     sentence: str = ""
 
 
@@ -69,6 +71,7 @@ class WavefrontFile:
         sentences: What the outcomes mean.
         noll: Noll index of every mode.
         residual: Data - model in electrons; None when not kept.
+        amplitude: Of the light over that of the telescope, NaN outside the pupil; None where it was taken as known.
         source: The file the frames came from.
         source_digest: First digits of the SHA-256 of that file.
     """
@@ -94,6 +97,7 @@ class WavefrontFile:
     photon_loss: Float[np.ndarray, " frame"] | None = None
     wrong_turn: Float[np.ndarray, " frame"] | None = None
     residual: Float[np.ndarray, "frame plane y x"] | None = None
+    amplitude: Float[np.ndarray, "frame y x"] | None = None
     source: str = ""
     source_digest: str = ""
 
@@ -165,6 +169,7 @@ class WavefrontFile:
             error_nm=column("error_nm", np.nan) if frames.truth_m is not None else known("error_nm"),
             **{name: known(name) for name in ("quantum_limit_nm", "photon_loss", "wrong_turn")},
             residual=known("residual", np.full(shape[1:], np.nan)),
+            amplitude=known("amplitude", np.full(shape[2:], np.nan)),
             source=frames.source,
             source_digest=frames.source_digest,
         )
@@ -197,6 +202,7 @@ class WavefrontFile:
             photon_loss=told(self.photon_loss),
             wrong_turn=told(self.wrong_turn),
             residual=None if self.residual is None else self.residual[number],
+            amplitude=None if self.amplitude is None else self.amplitude[number],
             sentence=self.sentences[number],
         )
 

@@ -32,8 +32,8 @@ def write_wavefront(path: str | Path, wavefront: WavefrontFile, provenance: Prov
     """Write a wavefront, whole or not at all.
 
     With several frames the header carries medians over the frames that ran, and the table FRAMES a row per
-    frame. A number that is not known is a keyword without a value, or NaN in a table. The residual is stored
-    in single precision, far below its noise.
+    frame. A number that is not known is a keyword without a value, or NaN in a table. Residual and
+    amplitude are stored in single precision, far below their noise.
 
     Raises:
         FileFormatError: If the file cannot be written.
@@ -73,11 +73,12 @@ def write_wavefront(path: str | Path, wavefront: WavefrontFile, provenance: Prov
         cards.append(("INSHA256", wavefront.source_digest, "first digits, of the input"))
     hdus: list[Any] = [fits.PrimaryHDU(opd_m, header_of(cards))]
     hdus.append(fits.BinTableHDU.from_columns(_mode_columns(wavefront), name="MODES"))
-    if wavefront.residual is not None:
-        residual = (wavefront.residual if wavefront.has_frame_axis else wavefront.residual[0]).astype(np.float32)
-        about = ("BUNIT", "electron", "data - model")
-        header = header_of([about, *position_cards(residual.shape, wavefront.pixel_m)])
-        hdus.append(fits.ImageHDU(residual, header, name="RESIDUAL"))
+    maps = (("RESIDUAL", wavefront.residual, "electron", "data - model"), ("AMPLITUDE", wavefront.amplitude, "", ""))
+    for name, values, unit, meaning in maps:
+        if values is not None:
+            single = (values if wavefront.has_frame_axis else values[0]).astype(np.float32)
+            header = header_of([("BUNIT", unit, meaning), *position_cards(single.shape, wavefront.pixel_m)])
+            hdus.append(fits.ImageHDU(single, header, name=name))
     if wavefront.has_frame_axis:
         hdus.append(fits.BinTableHDU.from_columns(_frame_columns(wavefront), name="FRAMES"))
     write_hdus(path, hdus)
@@ -103,6 +104,9 @@ def read_wavefront(path: str | Path) -> WavefrontFile:
     residual = parts["RESIDUAL"].data if "RESIDUAL" in parts else None
     if residual is not None:
         residual = np.asarray(residual, np.float64).reshape(len(opd_m), -1, *opd_m.shape[-2:])
+    amplitude = parts["AMPLITUDE"].data if "AMPLITUDE" in parts else None
+    if amplitude is not None:
+        amplitude = np.asarray(amplitude, np.float64).reshape(opd_m.shape)
     lengths = {
         name: keywords.number(key, "must be a positive length in metres", lambda value: value > 0)
         for name, key in (("pixel_m", "PIXSCALE"), ("wavelength_m", "WAVELEN"), ("diameter_m", "TELDIAM"))
@@ -112,6 +116,7 @@ def read_wavefront(path: str | Path) -> WavefrontFile:
         has_frame_axis=has_frame_axis,
         method=method,
         residual=residual,
+        amplitude=amplitude,
         source=str(keywords.value("INPUT") or ""),
         source_digest=str(keywords.value("INSHA256") or ""),
         **lengths,

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
+from nlcwfs.estimation.expected_amplitude import refuse_estimated
 from nlcwfs.simulation.closed_loop.flow import carried_curvature
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.lenslets import FollowedSpots
@@ -62,6 +63,7 @@ def build_sensor(config: Config, light: LoopLight) -> LoopSensor:
         SettingsError: If settings contradict each other.
     """
     loop, method = config.loop, config.estimation.method
+    refuse_estimated(config.estimation, because="nlcwfs loop")
     carries = loop.sensor == "shack-hartmann" or (loop.sensor == "curvature" and method == "map" and loop.follow)
     if config.feedback.controller == "kalman" and not carries:
         rule = "filters the air of loop.sensor = shack-hartmann, or of curvature with method = map and loop.follow"
