@@ -17,11 +17,12 @@ class Capture(NamedTuple):
     Attributes:
         captured_nm: Its error is below this.
         score: Which error judges what is believed: on the grid of the light (`fine`), or of the mean over every
-            detector pixel (`pixels`); or of the pistons of segments modulo the wavelength (`segments`).
+            detector pixel (`pixels`); or of the pistons of segments modulo the wavelength (`segments`); with `turns`
+            the page tells of their whole wavelengths instead.
     """
 
     captured_nm: float
-    score: Literal["fine", "pixels", "segments"] = "fine"
+    score: Literal["fine", "pixels", "segments", "turns"] = "fine"
 
 
 class Case(BaseModel):
@@ -72,10 +73,10 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
-    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments"], ...] = ()
+    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments", "turns"], ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
-    score: Literal["fine", "pixels", "segments"] = "fine"
+    score: Literal["fine", "pixels", "segments", "turns"] = "fine"
     set: tuple[str, ...] = ()
     case: tuple[Case, ...]
 
