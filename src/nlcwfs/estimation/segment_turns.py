@@ -16,7 +16,8 @@ from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.whitened_phase import Unknown
 
 FARTHEST = 8
-"""Turns that are looked at: a walk without fringes was seen to end seven turns off."""
+"""Turns that are looked at. A model of few colors shows fringes again on far turns, where the fringes of most of its
+colors are in step: one of five colors over half the wavelength on the seventh."""
 
 ALL_UP_TO = 4
 """Segments of a pupil of which all turns are looked at together: their number goes with the power."""
@@ -110,6 +111,7 @@ def _on_best_turns(
 
     def sweep(carry: tuple[Solution, Array, Array, Array]) -> tuple[Solution, Array, Array, Array]:
         base, _, _, count = carry
+        base = solved(task, settings, base.unknown, (base.steps, base.ffts))  # as many steps as those that are tried
         turns, costs = looked(SegmentLight.build(task, steps, base), moves)
         whole = jnp.round(turns - turns[:, :1])
         costs = jnp.where(jnp.all(whole == 0, axis=1), jnp.inf, base.cost + costs)
@@ -118,8 +120,7 @@ def _on_best_turns(
             best, costs, told = carry
             one = jnp.argmin(costs)
             tried = solved(task, settings, _moved(steps, base.unknown, turns[one]), (best.steps, best.ffts))
-            went = (tried.unknown.slope - base.unknown.slope)[2 : 2 + steps.count] * steps.rms_rad[0] / (2 * jnp.pi)
-            came_back = jnp.all(jnp.round(went - went[0]) == 0) | jnp.isinf(costs[one])
+            came_back = jnp.all(_went(steps, base, tried) == 0) | jnp.isinf(costs[one])
             told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, base.cost)))
             same = jnp.all(whole == whole[one], axis=1)
             return likelier(tried, best), jnp.where(same, jnp.inf, costs), told
@@ -128,7 +129,7 @@ def _on_best_turns(
         start = base._replace(ffts=base.ffts + shining)
         best, costs, told = jax.lax.fori_loop(0, TRIED, visit, (start, costs, told))
         others = jnp.concatenate([told, jnp.maximum(costs, base.cost)])
-        return best, share_of_others(base.cost, others), best.cost < base.cost, count + 1
+        return best, share_of_others(base.cost, others), jnp.any(_went(steps, base, best)), count + 1
 
     def goes_on(carry: tuple[Solution, Array, Array, Array]) -> Bool[Array, ""]:
         return carry[2] & (carry[3] < settings.turn_sweeps)
@@ -165,6 +166,12 @@ def looked(
     last, cost = jax.lax.fori_loop(0, count, further, (none, jnp.zeros((), moves.dtype)))
     turns, costs = around(none)
     return jnp.concatenate([last[None], turns]), jnp.concatenate([cost[None], costs])
+
+
+def _went(steps: SegmentSteps, first: Solution, last: Solution) -> Float[Array, " segment"]:
+    """Whole turns against the first segment from one solution to another."""
+    piston = (last.unknown.slope - first.unknown.slope)[2 : 2 + steps.count] * steps.rms_rad[0] / (2 * jnp.pi)
+    return jnp.round(piston - piston[0])
 
 
 def _moved(steps: SegmentSteps, unknown: Unknown, turns: Float[Array, " segment"]) -> Unknown:
