@@ -31,6 +31,9 @@ STRETCHES = (1.0, 1.04, 1.08)
 TRIED = 5
 """Turns that look most likely, for which all else is solved again."""
 
+LEAD = 1.0
+"""Nats by which other turns must be more likely: two that are as likely would take turns as each goes on to settle."""
+
 PAIRS_AT_MOST = 256
 """Pairs of segments whose light fits into memory: 36 hexagons have 90, an ELT has thousands."""
 
@@ -123,7 +126,7 @@ def _on_best_turns(
             came_back = jnp.all(_went(steps, base, tried) == 0) | jnp.isinf(costs[one])
             told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, base.cost)))
             same = jnp.all(whole == whole[one], axis=1)
-            return likelier(tried, best), jnp.where(same, jnp.inf, costs), told
+            return likelier(tried, best, lead=LEAD), jnp.where(same, jnp.inf, costs), told
 
         told = jnp.full(TRIED, jnp.inf, costs.dtype)
         start = base._replace(ffts=base.ffts + shining)
