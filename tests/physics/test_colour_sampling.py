@@ -121,7 +121,11 @@ def test_fringes_of_steps_in_few_wavelengths_are_as_wrong_as_drawn_steps_show(co
     still = ColouredImage(DIAMETER_M, inverse(0.0), lambda apart_m: 0 * apart_m, fringes=fringes)
     draws = 100_000
     pairs = np.array([(0, 1), (0, 2), (1, 2)])[rng.integers(0, 3, draws)]
-    ends_m = np.array(given_m)[pairs] + rng.uniform(-range_m, range_m, (draws, 2)) + rng.normal(0, tilt_m, (2, draws, 2)).sum(0)
+    ends_m = (
+        np.array(given_m)[pairs]
+        + rng.uniform(-range_m, range_m, (draws, 2))
+        + rng.normal(0, tilt_m, (2, draws, 2)).sum(0)
+    )
     steps_m = ends_m[:, 0] - ends_m[:, 1]
 
     def fringe(spectrum):

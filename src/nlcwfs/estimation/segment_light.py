@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.field import pupil_field
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
@@ -60,16 +60,16 @@ class SegmentLight(eqx.Module):
         if colours is None:
             raise ValueError("task.level.colours: must be there, got None")
         phase_rad = problem.known_rad + problem.prior.phase_rad(known.unknown)
-        maps = task.scale.counts * interference(task.level, steps, phase_rad)
+        maps = task.scale.counts[None, None, None] * interference(task.level, steps, phase_rad)
         counts = jnp.maximum(problem.counts, 0)
-        weight = problem.usable / ((known.model + counts) / 2 + problem.dark)
+        weight = problem.usable.astype(counts.dtype) / ((known.model + counts) / 2 + problem.dark)
         left = (weight * (problem.counts - known.model)).ravel()
         flat = maps.reshape(-1, left.size)
         wavelengths_m = jnp.asarray(colours.spectrum.wavelengths_m, left.dtype)
         rms = steps.rms_rad[0] / (2 * jnp.pi)
         return cls(
             pull=flat @ left,
-            gram=(flat * weight.ravel()) @ flat.T,
+            gram=(flat * weight.ravel()[None]) @ flat.T,
             ratios=task.level.optics.spectrum.wavelengths_m[0] / wavelengths_m,
             here=known.unknown.slope[2 : 2 + steps.count] * rms,
             rms=rms,
@@ -86,7 +86,7 @@ class SegmentLight(eqx.Module):
         """The nearest pistons that are most likely, and their cost."""
         none = self._factors(jnp.zeros_like(turns))
 
-        def closer(_: int, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        def closer(_: Int[Array, ""], carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             now, best, least = carry
             slopes = jax.jacfwd(self._factors)(now)
             seen = self.gram @ slopes
@@ -102,7 +102,7 @@ class SegmentLight(eqx.Module):
 
     def _factors(self, turns: Float[Array, " segment"]) -> Float[Array, " map"]:
         first, second = np.array(self.pairs).T
-        angle = 2 * jnp.pi * (turns[first] - turns[second]) * self.ratios[:, None]
+        angle = 2 * jnp.pi * (turns[first] - turns[second])[None] * self.ratios[:, None]
         return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=2).ravel()
 
 
@@ -119,18 +119,18 @@ def interference(
         steps: The segments.
         phase_rad: Of the wavelength of sensing.
     """
-    sensor, planes = level.colours, level.optics.transfer.shape[1]
+    sensor, planes, kind = level.colours, level.optics.transfer.shape[1], level.optics.transfer.dtype
     if sensor is None:
         raise ValueError("level.colours: must be there, got None")
     opd_m = phase_rad * (level.optics.spectrum.wavelengths_m[0] / (2 * np.pi)) + sensor.static_opd_m
-    alone = steps.labels.reshape(steps.shape) == jnp.arange(steps.count)[:, None, None]
+    alone = steps.labels.reshape(1, *steps.shape) == jnp.arange(steps.count)[:, None, None]
     first, second = np.array(steps.pairs).T
     own_transfer = sensor.transfer if len(sensor.transfer) > 1 else None
     own_smear = sensor.visibility if sensor.visibility is not None and len(sensor.visibility) > 1 else None
 
     def of_colour(one: tuple[Array, Array, Array | None, Array | None]) -> Array:
         wavelength_m, share, transfer, smear = one
-        near = pupil_field(sensor.pupil, opd_m, wavelength_m=wavelength_m, photons=share) * alone
+        near = pupil_field(sensor.pupil, opd_m, wavelength_m=wavelength_m, photons=share)[None] * alone.astype(kind)
         transfer = sensor.transfer[0] if transfer is None else transfer
         smear = sensor.visibility[0] if smear is None and sensor.visibility is not None else smear
         far = jax.lax.map(lambda field: jnp.fft.ifft2(jnp.fft.fft2(field)[None] * transfer), near)
@@ -142,16 +142,15 @@ def interference(
 
         return jax.lax.map(of_pair, (jnp.asarray(first), jnp.asarray(second)))
 
-    wavelengths_m, shares = (jnp.asarray(one, opd_m.dtype) for one in (sensor.spectrum.wavelengths_m, sensor.spectrum.shares))
-    return jax.lax.map(of_colour, (wavelengths_m, shares, own_transfer, own_smear))
+    spectrum = sensor.spectrum
+    colours = (jnp.asarray(one, opd_m.dtype) for one in (spectrum.wavelengths_m, spectrum.shares))
+    return jax.lax.map(of_colour, (*colours, own_transfer, own_smear))
 
 
-def _seen(
-    sensor: CurvatureSensor, light: Float[Array, "plane y x"], smear: Array | None
-) -> Float[Array, "plane y x"]:
+def _seen(sensor: CurvatureSensor, light: Float[Array, "plane y x"], smear: Array | None) -> Float[Array, "plane y x"]:
     """Shared among the planes, and smeared by the size of the star."""
     light = sensor.flux_fractions[:, None, None] * light
     if smear is None:
         return light
-    waves: Complex[Array, "plane y fx"] = jnp.fft.rfft2(light) * smear
+    waves = jnp.fft.rfft2(light) * smear.astype(sensor.transfer.dtype)
     return jnp.fft.irfft2(waves, s=light.shape[1:]).astype(light.dtype)

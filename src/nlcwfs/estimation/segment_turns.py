@@ -125,7 +125,7 @@ def _on_best_turns(
             tried = solved(task, settings, _moved(steps, base.unknown, turns[one]), (best.steps, best.ffts))
             came_back = jnp.all(_went(steps, base, tried) == 0) | jnp.isinf(costs[one])
             told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, base.cost)))
-            same = jnp.all(whole == whole[one], axis=1)
+            same = jnp.all(whole == whole[one][None], axis=1)
             return likelier(tried, best, lead=LEAD), jnp.where(same, jnp.inf, costs), told
 
         told = jnp.full(TRIED, jnp.inf, costs.dtype)
@@ -154,12 +154,12 @@ def looked(
     count = moves.shape[1]
 
     def around(turns: Float[Array, " segment"]) -> tuple[Array, Array]:
-        stretched = turns + jnp.asarray(STRETCHES, moves.dtype)[:, None, None] * moves
+        stretched = turns[None, None] + jnp.asarray(STRETCHES, moves.dtype)[:, None, None] * moves[None]
         starts = jax.vmap(jax.vmap(light.cost))(stretched)
         near = jnp.take_along_axis(stretched, jnp.argmin(starts, axis=0)[None, :, None], axis=0)[0]
         return jax.vmap(light.fitted)(near)
 
-    def further(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def further(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
         turns, costs = around(carry[0])
         one = jnp.argmin(costs)
         better = costs[one] < carry[1]

@@ -73,7 +73,9 @@ class Study(BaseModel):
     answer: str = "Not answered yet"
     notes: str = ""
     groups: dict[str, str] = {}
-    figures: tuple[Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments", "turns"], ...] = ()
+    figures: tuple[
+        Literal["convergence", "photons-and-turbulence", "cost", "calibration", "segments", "turns"], ...
+    ] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
     score: Literal["fine", "pixels", "segments", "turns"] = "fine"

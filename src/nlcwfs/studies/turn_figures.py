@@ -10,7 +10,11 @@ from matplotlib.figure import Figure
 from nlcwfs.studies.study_table import Row
 from nlcwfs.studies.table_axes import column
 
-FAMILIES = {"discs": ("C0", "o-", "achromatic lenses"), "ideal": ("C1", "s-", "ideal lenses"), "gmt": ("C2", "^-", "GMT")}
+FAMILIES = {
+    "discs": ("C0", "o-", "achromatic lenses"),
+    "ideal": ("C1", "s-", "ideal lenses"),
+    "gmt": ("C2", "^-", "GMT"),
+}
 """First words of the cases FAMILY-PHOTONS: color, mark and label."""
 
 LEAST_TOLD = 1e-4
