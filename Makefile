@@ -49,6 +49,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sweep studies/10-colour-loop
 	$(BIN)/nlcwfs study studies/11-sparse-pupil
 	$(BIN)/nlcwfs study studies/12-whole-wavelengths
+	$(BIN)/nlcwfs study studies/15-any-pupil
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructors against that of their own FFTs, and of a frame of the loop

@@ -21,6 +21,7 @@ STUDIES = (
     "10-colour-loop",
     "11-sparse-pupil",
     "12-whole-wavelengths",
+    "15-any-pupil",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 
