@@ -91,7 +91,7 @@ class SegmentLight(eqx.Module):
             slopes = jax.jacfwd(self._factors)(now)
             seen = self.gram @ slopes
             uphill = seen.T @ (self._factors(now) - none) - self.pull @ slopes + (self.here + now) / self.rms**2
-            curvature = slopes.T @ seen + jnp.eye(len(now)) / self.rms**2
+            curvature = slopes.T @ seen + jnp.eye(len(now), dtype=now.dtype) / self.rms**2
             now = now - jnp.clip(jnp.linalg.solve(curvature, uphill), -0.25, 0.25)
             cost = self.cost(now)
             return now, jnp.where(cost < least, now, best), jnp.minimum(cost, least)
