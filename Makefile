@@ -48,6 +48,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sensitivity studies/09-one-family
 	$(BIN)/nlcwfs sweep studies/10-colour-loop
 	$(BIN)/nlcwfs study studies/11-sparse-pupil
+	$(BIN)/nlcwfs study studies/12-whole-wavelengths
 	$(BIN)/nlcwfs study studies/13-no-chromatic-lenses
 	$(BIN)/nlcwfs study studies/14-sky-budgets
 	$(BIN)/nlcwfs study studies/15-any-pupil

@@ -20,6 +20,7 @@ STUDIES = (
     "09-one-family",
     "10-colour-loop",
     "11-sparse-pupil",
+    "12-whole-wavelengths",
     "13-no-chromatic-lenses",
     "14-sky-budgets",
     "15-any-pupil",

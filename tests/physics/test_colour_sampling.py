@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from nlcwfs.atmosphere.phase_screen import PhaseScreens, Turbulence
-from nlcwfs.beam.colour_sampling import ColouredImage, sampling_error, wavelengths_needed
+from nlcwfs.beam.colour_sampling import (
+    FRINGE_ERROR_ALLOWED,
+    ColouredImage,
+    fringe_error,
+    sampling_error,
+    step_coherence,
+    wavelengths_needed,
+)
 from nlcwfs.beam.fresnel import fresnel_transfer
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.light_band import LightBand
@@ -103,3 +110,47 @@ def test_colours_from_different_directions_are_less_alike():
     assert found == pytest.approx(
         expected, abs=0.02
     )  # s differs by 5 % between the colours; 150 000 random pairs: 0.002
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fringes_of_steps_in_few_wavelengths_are_as_wrong_as_drawn_steps_show(count):
+    """Still air and ideal lenses: only exp(i k step) changes with the color. Given steps, drawn pistons, tilts."""
+    rng, band = np.random.default_rng(5), LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.4 * WAVELENGTH_M)
+    given_m, range_m, tilt_m = [0.0, 3e-7, -4e-7], 5e-7, 6e-8
+    fringes = step_coherence(pistons_m=given_m, range_m=range_m, tilt_rms_m=tilt_m)
+    still = ColouredImage(DIAMETER_M, inverse(0.0), lambda apart_m: 0 * apart_m, fringes=fringes)
+    draws = 100_000
+    pairs = np.array([(0, 1), (0, 2), (1, 2)])[rng.integers(0, 3, draws)]
+    ends_m = (
+        np.array(given_m)[pairs]
+        + rng.uniform(-range_m, range_m, (draws, 2))
+        + rng.normal(0, tilt_m, (2, draws, 2)).sum(0)
+    )
+    steps_m = ends_m[:, 0] - ends_m[:, 1]
+
+    def fringe(spectrum):
+        phase = 2 * np.pi * steps_m[:, None] / np.array(spectrum.wavelengths_m)
+        return np.exp(1j * phase) @ np.array(spectrum.shares)
+
+    dense = fringe(band.spectrum(24))
+    wrong = np.mean(np.abs(fringe(band.spectrum(count)) - dense) ** 2)
+    expected = np.sqrt(wrong / np.mean(np.abs(dense) ** 2))
+    assert fringe_error(still, band, band.spectrum(count)) == pytest.approx(expected, rel=0.02)  # 5 sigma of the draws
+
+
+@pytest.mark.parametrize("law", [constant, inverse])
+def test_images_with_steps_of_a_wave_are_right_with_the_wavelengths_that_are_needed(law):
+    """Two halves with a gap; what the step changes is the measure. Without the steps the rule takes too few."""
+    band, distance_m = LightBand.flat(wavelength_m=WAVELENGTH_M, bandwidth_m=0.5 * WAVELENGTH_M), law(150e3)
+    flat, steps = (lambda apart_m: 0 * apart_m), step_coherence(range_m=WAVELENGTH_M)
+    needed = wavelengths_needed([ColouredImage(DIAMETER_M, distance_m, flat, fringes=steps)], band)
+    without = wavelengths_needed([ColouredImage(DIAMETER_M, distance_m, flat)], band)
+    opd_m = np.where(GRID.x_m > 0, 1.9 * WAVELENGTH_M, 0) * np.ones(GRID.shape)
+    dense = image_of(opd_m, distance_m, band.spectrum(64))
+    shown = np.sqrt(np.sum((dense - image_of(0 * opd_m, distance_m, band.spectrum(64))) ** 2))
+    errors = [
+        np.sqrt(np.sum((image_of(opd_m, distance_m, band.spectrum(count)) - dense) ** 2)) / shown
+        for count in (needed, without)
+    ]
+    # This step is the longest that the range allows, whose fringes are the fewest: 3 times the rms error is allowed.
+    assert errors[0] < 3 * FRINGE_ERROR_ALLOWED < errors[1], (needed, without, errors)

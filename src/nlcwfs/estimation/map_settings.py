@@ -111,8 +111,8 @@ class MapSettings(BaseModel):
         default=6,
         ge=0,
         le=100,
-        description="most times that each segment of a pupil is tried a wavelength higher and lower, in a model of "
-        "many wavelengths; 0 leaves the whole wavelengths of the first guess",
+        description="most times that other whole wavelengths of a pupil's segments are looked for, in a model of many "
+        "wavelengths; 0 leaves those of the first guess",
     )
     sequence_steps: int = Field(
         default=3, ge=1, le=100, description="Gauss-Newton steps for each frame of a sequence after the first"

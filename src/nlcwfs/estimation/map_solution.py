@@ -160,9 +160,9 @@ def searched(task: Task, settings: MapSettings, unknown: Unknown, before: tuple[
     return jax.lax.while_loop(lambda search: ~search.agreed & (search.healings < settings.healings), again, start)
 
 
-def likelier(tried: Solution, best: Solution) -> Solution:
-    """The more likely of two solutions, with the account of what was tried last."""
-    better = tried.cost < best.cost
+def likelier(tried: Solution, best: Solution, *, lead: float = 0.0) -> Solution:
+    """The more likely of two solutions, with the account of what was tried last; it must lead by so many nats."""
+    better = tried.cost < best.cost - lead
     kept: Solution = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
     return kept._replace(steps=tried.steps, ffts=tried.ffts)
 

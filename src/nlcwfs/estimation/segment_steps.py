@@ -1,5 +1,7 @@
 """Piston, tip and tilt of each segment of a pupil, as unknowns of their own: no turbulence expects a step."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,9 @@ from nlcwfs.beam.grid import Grid
 from nlcwfs.estimation.prior_settings import PriorSettings
 from nlcwfs.estimation.resolution_level import LIT, Level
 from nlcwfs.estimation.sensor_geometry import SensorGeometry
+
+ALL_PAIRS_UP_TO = 12
+"""Segments of a pupil of which the light of every two is looked at: their number goes with the square."""
 
 
 class SegmentSteps(eqx.Module):
@@ -28,6 +33,7 @@ class SegmentSteps(eqx.Module):
         inverse: From the sums of a phase with 1, y and x over the light of each segment to its straight part.
         rms_rad: Expected piston and expected tilt along one axis.
         count: Number of segments.
+        pairs: Segments whose light meets, see `neighbours`.
 
     Examples:
         >>> labels = np.repeat([[0, 0, 0, 0, 1, 1, 1, 1]], 4, axis=0)
@@ -48,6 +54,7 @@ class SegmentSteps(eqx.Module):
     rms_rad: Float[Array, "2"]
     shape: tuple[int, int] = eqx.field(static=True)
     count: int = eqx.field(static=True)
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
     @classmethod
     def build(
@@ -90,6 +97,7 @@ class SegmentSteps(eqx.Module):
             nearest=jnp.asarray(_nearest_of_segment(seen.reshape(labels.shape) > 0, labels).ravel()),
             shape=grid.shape,
             count=count,
+            pairs=neighbours(labels),
         )
 
     def phase_rad(self, steps: Float[Array, " step"]) -> Float[Array, "y x"]:
@@ -167,6 +175,25 @@ def steps_of(geometry: SensorGeometry, level: Level, prior: PriorSettings, *, dt
         tilt_rms_rad=prior.segment_tilt_nm * to_rad,
         dtype=dtype,
     )
+
+
+def neighbours(labels: Int[np.ndarray, "y x"]) -> tuple[tuple[int, int], ...]:
+    """Every two segments of a few; of more than `ALL_PAIRS_UP_TO` those that share a border.
+
+    Args:
+        labels: Segment of each cell, lit or dark, from 0.
+
+    Examples:
+        >>> neighbours(np.array([[0, 0, 1, 2]])), len(neighbours(np.arange(16).reshape(4, 4)))
+        (((0, 1), (0, 2), (1, 2)), 24)
+    """
+    count = int(labels.max()) + 1
+    if count <= ALL_PAIRS_UP_TO:
+        return tuple(itertools.combinations(range(count), 2))
+    beside = [(labels[1:], labels[:-1]), (labels[:, 1:], labels[:, :-1])]
+    both = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in beside])
+    unlike = np.unique(np.sort(both[both[:, 0] != both[:, 1]], axis=1), axis=0)
+    return tuple((int(one), int(other)) for one, other in unlike)
 
 
 def _nearest_of_segment(lit: np.ndarray, labels: np.ndarray) -> np.ndarray:

@@ -10,33 +10,41 @@ from jaxtyping import Array, Bool, Float, Int
 from nlcwfs.estimation import gauss_newton as gn
 from nlcwfs.estimation.map_settings import MapSettings
 from nlcwfs.estimation.map_solution import Search, Solution, Task, likelier, solved
-from nlcwfs.estimation.segment_steps import SegmentSteps
+from nlcwfs.estimation.segment_light import SegmentLight
+from nlcwfs.estimation.segment_steps import ALL_PAIRS_UP_TO, SegmentSteps
 from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.whitened_phase import Unknown
 
-PAIRS_UP_TO = 12
-"""Segments of a pupil of which two are moved at once: their number goes with the square."""
-
-FAR = (2.1, 3.3)
-"""Turns that are made at once, where there are no fringes left that one turn more would raise."""
+FARTHEST = 8
+"""Turns that are looked at. A model of few colors shows fringes again on far turns, where the fringes of most of its
+colors are in step: one of five colors over half the wavelength on the seventh."""
 
 ALL_UP_TO = 4
-"""Segments of a pupil of which all turns are looked at: their number goes with the power."""
+"""Segments of a pupil of which all turns are looked at together: their number goes with the power."""
+
+TOGETHER = 2
+"""Turns of all segments at once: a first guess of steps up to two waves."""
 
 STRETCHES = (1.0, 1.04, 1.08)
 """Turns of a band: the longer waves keep their fringes on wrong turns, which lie further apart by that."""
 
-NEAR = 30.0
-"""A try that is less likely by more nats than this after its first step is given up."""
+TRIED = 5
+"""Turns that look most likely, for which all else is solved again."""
+
+LEAD = 1.0
+"""Nats by which other turns must be more likely: two that are as likely would take turns as each goes on to settle."""
+
+PAIRS_AT_MOST = 256
+"""Pairs of segments whose light fits into memory: 36 hexagons have 90, an ELT has thousands."""
 
 
 def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tuple[Search, Float[Array, ""] | None]:
     """The search, with whole wavelengths added to segments where that makes it more likely, all else solved again.
 
-    Of a few segments all turns are looked at first. Then each of `moves_of` is tried until none gains. A wrong turn is
-    a maximum of its own: its fringes have less contrast, and those of other colors are shifted. Two segments that are
-    off together may hold each other, and far off, where there are no fringes left, one turn makes no difference. A try
-    takes one step, and more if it may win.
+    A wrong turn is a maximum of its own: its fringes have less contrast, and those of other colors are shifted. Two
+    segments that are off together may hold each other, and far off, where there are no fringes left, one turn makes no
+    difference. So many turns are looked at, near and far, by the light of the segments alone (`segment_light`); the
+    most likely of them are solved with all else, and what is likelier is kept, until nothing gains.
 
     Args:
         task: The exposure.
@@ -45,12 +53,14 @@ def with_turns(task: Task, settings: EstimationSettings, search: Search) -> tupl
 
     Returns:
         The search, its best solution on the turns found; and the probability that these are wrong: the share of the
-        posterior of all solutions that were tried around it. It is 1 if the sweeps were used up before the turns came
-        to rest, and None where nothing tells turns: in one color, on one segment.
+        posterior of all that was looked at around it. It is 1 if the sweeps were used up before the turns came to
+        rest, and None where nothing tells turns: in one color, on one segment, of more than `PAIRS_AT_MOST` pairs.
     """
     steps = task.prior.steps
     asked = settings.map.turn_sweeps > 0 and settings.prior.segment_piston_nm > 0
-    if not asked or steps is None or steps.count < 2 or not task.level.has_band:
+    if not asked or steps is None or not task.level.has_band:
+        return search, None
+    if not 1 <= len(steps.pairs) <= PAIRS_AT_MOST:
         return search, None
     return _on_best_turns(task, steps, settings.map, search)
 
@@ -74,82 +84,97 @@ def share_of_others(cost: Float[Array, ""], others: Float[Array, " other"]) -> F
 
 
 def moves_of(segments: int) -> Float[np.ndarray, "move segment"]:
-    """Turns that are added to the segments of a pupil: to one, to two, and many to those; no two moves are alike.
+    """Turns that are looked at: of one segment and of two up to `FARTHEST`, of few segments all up to `TOGETHER`.
 
-    Turns of all segments together are no move: no light tells them. Of more than `PAIRS_UP_TO` segments no two move.
+    Turns of all segments together are no move: no light tells them. Of more than `ALL_PAIRS_UP_TO` segments no two
+    move.
 
     Examples:
-        >>> moves_of(2).tolist()[:4], len(moves_of(4)), len(moves_of(36))
-        ([[-1.0, 0.0], [1.0, 0.0], [-1.0, 1.0], [1.0, -1.0]], 54, 216)
+        >>> moves_of(2)[:, 1].tolist()
+        [-8.0, -7.0, -6.0, -5.0, -4.0, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+        >>> len(moves_of(4)), len(moves_of(7)), len(moves_of(36))
+        (284, 784, 576)
     """
     alone = list(np.eye(segments))
-    paired = list(itertools.combinations(alone, 2)) if segments <= PAIRS_UP_TO else []
-    together = [one + other for one, other in paired]
-    moves = [sign * one for one in alone for sign in (-1, 1)]
-    moves += [sign * one for one in together + [one - other for one, other in paired] for sign in (-1, 1)]
-    moves += [sign * far * one for far in FAR for one in alone + together for sign in (-1, 1)]
-    unlike: dict[tuple[float, ...], np.ndarray] = {}
-    for move in moves:
-        unlike.setdefault(tuple(np.round(move - move[0], 6)), move)
-    unlike.pop((0.0,) * segments, None)
-    return np.array(list(unlike.values())).reshape(-1, segments) + 0.0
-
-
-def all_turns_of(segments: int) -> Float[np.ndarray, "move segment"]:
-    """All turns against the first segment that a first guess of steps up to two waves may be off, and some longer.
-
-    Examples:
-        >>> all_turns_of(2)[:5, 1].tolist(), len(all_turns_of(4))
-        ([-2.0, -1.0, 0.0, 1.0, 2.0], 375)
-    """
-    whole = [(0, *others) for others in itertools.product(range(-2, 3), repeat=segments - 1)]
-    return np.concatenate([stretch * np.array(whole, float) for stretch in STRETCHES])
+    paired = list(itertools.combinations(alone, 2)) if segments <= ALL_PAIRS_UP_TO else []
+    ways = alone + [one + other for one, other in paired] + [one - other for one, other in paired]
+    moves = [turns * way for way in ways for turns in range(-FARTHEST, FARTHEST + 1)]
+    if segments <= ALL_UP_TO:
+        near = range(-TOGETHER, TOGETHER + 1)
+        moves += [np.array((0.0, *others)) for others in itertools.product(near, repeat=segments - 1)]
+    unlike = {tuple(move - move[0]) for move in moves if 0 < np.ptp(move) <= FARTHEST}
+    return np.array(sorted(unlike)) + 0.0
 
 
 def _on_best_turns(
     task: Task, steps: SegmentSteps, settings: MapSettings, search: Search
 ) -> tuple[Search, Float[Array, ""]]:
-    turn = 2 * jnp.pi / steps.rms_rad[0]
-    best = _on_best_of_all(task, steps, settings, search.best)
-    quick = settings.model_copy(update={"steps": 1})
     moves = jnp.asarray(moves_of(steps.count), search.best.cost.dtype)
-
-    def more(solution: Solution) -> Solution:
-        return solved(task, settings, solution.unknown, (solution.steps, solution.ffts))
-
-    def visit(number: Int[Array, ""], carry: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
-        best, told, changed = carry
-        first = solved(task, quick, _moved(steps, best.unknown, moves[number]), (best.steps, best.ffts))
-        tried = jax.lax.cond(first.cost < best.cost + NEAR, more, lambda solution: solution, first)
-        went = (tried.unknown.slope - best.unknown.slope)[2 : 2 + steps.count]
-        came_back = jnp.dot(went, moves[number]) < turn / 2 * jnp.dot(moves[number], moves[number])
-        told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, best.cost)))
-        return likelier(tried, best), told, changed | (tried.cost < best.cost)
+    shining = steps.count * gn.ffts_per_try(task.problem.counts.shape[0], colours=task.level.colour_count)
 
     def sweep(carry: tuple[Solution, Array, Array, Array]) -> tuple[Solution, Array, Array, Array]:
-        best, told, _, count = carry
-        best, told, changed = jax.lax.fori_loop(0, told.size, visit, (best, told, jnp.asarray(False)))
-        return best, told, changed, count + 1
+        base, _, _, count = carry
+        base = solved(task, settings, base.unknown, (base.steps, base.ffts))  # as many steps as those that are tried
+        turns, costs = looked(SegmentLight.build(task, steps, base), moves)
+        whole = jnp.round(turns - turns[:, :1])
+        costs = jnp.where(jnp.all(whole == 0, axis=1), jnp.inf, base.cost + costs)
+
+        def visit(number: Int[Array, ""], carry: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
+            best, costs, told = carry
+            one = jnp.argmin(costs)
+            tried = solved(task, settings, _moved(steps, base.unknown, turns[one]), (best.steps, best.ffts))
+            came_back = jnp.all(_went(steps, base, tried) == 0) | jnp.isinf(costs[one])
+            told = told.at[number].set(jnp.where(came_back, jnp.inf, jnp.maximum(tried.cost, base.cost)))
+            same = jnp.all(whole == whole[one][None], axis=1)
+            return likelier(tried, best, lead=LEAD), jnp.where(same, jnp.inf, costs), told
+
+        told = jnp.full(TRIED, jnp.inf, costs.dtype)
+        start = base._replace(ffts=base.ffts + shining)
+        best, costs, told = jax.lax.fori_loop(0, TRIED, visit, (start, costs, told))
+        others = jnp.concatenate([told, jnp.maximum(costs, base.cost)])
+        return best, share_of_others(base.cost, others), jnp.any(_went(steps, base, best)), count + 1
 
     def goes_on(carry: tuple[Solution, Array, Array, Array]) -> Bool[Array, ""]:
         return carry[2] & (carry[3] < settings.turn_sweeps)
 
-    told = jnp.full(len(moves), jnp.inf, moves.dtype)
-    start = (best, told, jnp.asarray(True), jnp.asarray(0, jnp.int32))
-    best, told, changed, _ = jax.lax.while_loop(goes_on, sweep, start)
-    return search._replace(best=best), jnp.where(changed, 1.0, share_of_others(best.cost, told))
+    start = (search.best, jnp.ones_like(search.best.cost), jnp.asarray(True), jnp.asarray(0, jnp.int32))
+    best, wrong, changed, _ = jax.lax.while_loop(goes_on, sweep, start)
+    return search._replace(best=best), jnp.where(changed, 1.0, wrong)
 
 
-def _on_best_of_all(task: Task, steps: SegmentSteps, settings: MapSettings, best: Solution) -> Solution:
-    """Of a few segments all turns are looked at, as the light is predicted before anything else moves."""
-    if steps.count > ALL_UP_TO:
-        return best
-    moves = jnp.asarray(all_turns_of(steps.count), best.cost.dtype)
-    costs = jax.lax.map(lambda move: gn.cost(task.problem, _moved(steps, best.unknown, move)), moves)
-    looked = gn.ffts_per_try(task.problem.counts.shape[0], colours=task.level.colour_count) * len(moves)
-    move = moves[jnp.argmin(costs)]
-    tried = solved(task, settings, _moved(steps, best.unknown, move), (best.steps, best.ffts + looked))
-    return likelier(tried, best)
+def looked(
+    light: SegmentLight, moves: Float[Array, "move segment"]
+) -> tuple[Float[Array, "look segment"], Float[Array, " look"]]:
+    """Pistons near each move that fit best, and their cost; and what one move after the other leads to.
+
+    Args:
+        light: Of the segments.
+        moves: See `moves_of`.
+    """
+    count = moves.shape[1]
+
+    def around(turns: Float[Array, " segment"]) -> tuple[Array, Array]:
+        stretched = turns[None, None] + jnp.asarray(STRETCHES, moves.dtype)[:, None, None] * moves[None]
+        starts = jax.vmap(jax.vmap(light.cost))(stretched)
+        near = jnp.take_along_axis(stretched, jnp.argmin(starts, axis=0)[None, :, None], axis=0)[0]
+        return jax.vmap(light.fitted)(near)
+
+    def further(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        turns, costs = around(carry[0])
+        one = jnp.argmin(costs)
+        better = costs[one] < carry[1]
+        return jnp.where(better, turns[one], carry[0]), jnp.minimum(costs[one], carry[1])
+
+    none = jnp.zeros(count, moves.dtype)
+    last, cost = jax.lax.fori_loop(0, count, further, (none, jnp.zeros((), moves.dtype)))
+    turns, costs = around(none)
+    return jnp.concatenate([last[None], turns]), jnp.concatenate([cost[None], costs])
+
+
+def _went(steps: SegmentSteps, first: Solution, last: Solution) -> Float[Array, " segment"]:
+    """Whole turns against the first segment from one solution to another."""
+    piston = (last.unknown.slope - first.unknown.slope)[2 : 2 + steps.count] * steps.rms_rad[0] / (2 * jnp.pi)
+    return jnp.round(piston - piston[0])
 
 
 def _moved(steps: SegmentSteps, unknown: Unknown, turns: Float[Array, " segment"]) -> Unknown:

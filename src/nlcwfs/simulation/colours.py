@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.atmosphere.refraction import residual_dispersion_rad
-from nlcwfs.beam.colour_sampling import ColouredImage, sampling_error, wavelengths_needed
+from nlcwfs.beam.colour_sampling import ColouredImage, sampling_error, step_coherence, wavelengths_needed
 from nlcwfs.beam.light_band import LightBand, read_spectrum_table
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
@@ -288,12 +288,19 @@ def _images(config: Config, air: Turbulence, law: LensLaw) -> list[ColouredImage
     def structure_m2(separation_m: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
         return np.sum([one.structure_m2(separation_m) for one in kolmogorov], axis=0)
 
+    segments, fringes = config.beam.segments, None
+    if segments.layout != "none":
+        given_m = [piston_nm * 1e-9 for piston_nm in segments.pistons_nm] or [0.0, 0.0]
+        drawn = {"range_m": segments.piston_range_nm * 1e-9, "tilt_rms_m": segments.tilt_rms_nm * 1e-9}
+        fringes = step_coherence(pistons_m=given_m, **drawn)
+
     def at(plane_m: float) -> ColouredImage:
         return ColouredImage(
             diameter_m=config.beam.diameter_m,
             distance_m=lambda colour_m: float(plane_m * law.scale((colour_m,))[0]),
             structure_m2=structure_m2,
             direction_rad=lambda colour_m: _directions_rad(config, (colour_m,))[0],
+            fringes=fringes,
         )
 
     return [at(plane_m) for plane_m in sorted({abs(one) * 1e3 for one in config.curvature_sensor.distances_km})]

@@ -27,7 +27,7 @@ from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.score import wavefront_error_m
 from nlcwfs.simulation.segment_score import SegmentScore
 from nlcwfs.studies.mode_calibration import GROUPS_CPA, ModeErrors
-from nlcwfs.studies.step_columns import step_columns, step_errors, steps_captured
+from nlcwfs.studies.step_columns import step_columns, step_errors, steps_captured, turn_columns
 from nlcwfs.studies.study_cases import Capture, Case
 from nlcwfs.studies.study_light import Light, Progress, Screen
 from nlcwfs.studies.study_table import Row
@@ -50,6 +50,7 @@ class Scored(NamedTuple):
         milliseconds: Time that it took.
         groups: Squares of the errors of the modes over what was told, by group; NaN where nothing was told.
         steps: Errors of and inside the segments of the pupil; None for one piece.
+        told_wrong: Probability that the estimate tells for a wrong whole wavelength of a segment; NaN for none.
     """
 
     fine_nm: float
@@ -62,6 +63,7 @@ class Scored(NamedTuple):
     milliseconds: float
     groups: dict[str, float]
     steps: SegmentScore | None = None
+    told_wrong: float = math.nan
 
 
 def build_solver(case: Case, config: Config) -> tuple[Reconstructor, SensorGeometry]:
@@ -120,6 +122,7 @@ def _scored(
         milliseconds=math.nan,
         groups=groups,
         steps=step_errors(error_m, light.segments, wavelength_m=geometry.wavelength_m),
+        told_wrong=math.nan if found.wrong_turn is None else float(found.wrong_turn),
     )
 
 
@@ -128,7 +131,7 @@ def _summed_up(scored: list[Scored], capture: Capture) -> Row:
     fine_nm, pixels_nm = (np.array([getattr(one, name) for one in scored]) for name in ("fine_nm", "pixels_nm"))
     captured = fine_nm < capture.captured_nm
     right = captured if capture.score == "fine" else pixels_nm < capture.captured_nm
-    if capture.score == "segments":
+    if capture.score in ("segments", "turns"):
         right = steps_captured([one.steps for one in scored], capture.captured_nm)
     believed = np.array([one.outcome.succeeded for one in scored])
     ffts = [one.ffts for one in scored]
@@ -150,6 +153,7 @@ def _summed_up(scored: list[Scored], capture: Capture) -> Row:
         "doubted_right": float(np.mean(~believed & right)),
         **_over_predicted([one for one in scored if one.outcome.succeeded]),
         **step_columns([one.steps for one in scored], capture.captured_nm),
+        **turn_columns([one.steps for one in scored], [one.told_wrong for one in scored]),
     }
 
 

@@ -16,6 +16,7 @@ FigureName = Literal[
     "cost",
     "calibration",
     "segments",
+    "turns",
     "sky-budgets",
     "colours-for-lenses",
 ]
@@ -28,11 +29,12 @@ class Capture(NamedTuple):
     Attributes:
         captured_nm: Its error is below this.
         score: Which error judges what is believed: on the grid of the light (`fine`), or of the mean over every
-            detector pixel (`pixels`); or of the pistons of segments modulo the wavelength (`segments`).
+            detector pixel (`pixels`); or of the pistons of segments modulo the wavelength (`segments`); with `turns`
+            the page tells of their whole wavelengths instead.
     """
 
     captured_nm: float
-    score: Literal["fine", "pixels", "segments"] = "fine"
+    score: Literal["fine", "pixels", "segments", "turns"] = "fine"
 
 
 class Case(BaseModel):
@@ -89,7 +91,7 @@ class Study(BaseModel):
     figures: tuple[FigureName, ...] = ()
     screens: int = Field(default=100, ge=1)
     captured_nm: float = Field(default=60.0, gt=0)
-    score: Literal["fine", "pixels", "segments"] = "fine"
+    score: Literal["fine", "pixels", "segments", "turns"] = "fine"
     set: tuple[str, ...] = ()
     case: tuple[Case, ...]
 

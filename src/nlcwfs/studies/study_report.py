@@ -76,6 +76,19 @@ COLUMNS: dict[str, dict[str, Column]] = {
         "believed wrong": ("believed_wrong", "{:.0%}"),
         "doubted right": ("doubted_right", "{:.0%}"),
     },
+    "turns": SKY
+    | {
+        "trials": ("screens", "{}"),
+        "right": ("turns_right", "{:.1%}"),
+        "95 %": (("turns_right_low", "turns_right_high"), "{:.1%} to {:.1%}"),
+        "told wrong": ("told_wrong", "{:.2g}"),
+        "told of wrong, least": ("told_of_wrong_least", "{:.2g}"),
+        "told of right, median": ("told_of_right_median", "{:.1g}"),
+        "piston [nm]": ("piston_modulo_nm", "{:.1f}"),
+        "inside [nm]": ("inside_nm", "{:.1f}"),
+        "FFTs": ("ffts", "{:.0f}"),
+        "ms": ("ms_per_frame", "{:.0f}"),
+    },
 }
 """Columns of the page, by title, for each score of `Capture`."""
 
@@ -83,6 +96,7 @@ QUICK = {
     "fine": ("captured", "median_nm"),
     "pixels": ("captured_pixels", "median_pixels_nm"),
     "segments": ("captured_steps", "piston_modulo_nm"),
+    "turns": ("right_turns", "piston_modulo_nm"),
 }
 """What a quick look tells, for each score."""
 
