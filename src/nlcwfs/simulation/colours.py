@@ -24,7 +24,6 @@ from nlcwfs.curvature_sensor.membrane import (
     moving_light,
 )
 from nlcwfs.errors import SettingsError
-from nlcwfs.simulation.scintillation import refuse_heights
 
 TILTED_TO_FLAT = math.sqrt(1.0299 / 0.134)
 """Rms of Kolmogorov turbulence over a disc, tilt included, over that without tilt (Noll 1976, table IV)."""
@@ -173,47 +172,6 @@ def colour_account(config: Config, air: Turbulence) -> list[str]:
     if star.size_mas:
         lines.append(f"Star: {star.profile} of {star.size_mas:g} mas.")
     return lines
-
-
-def refuse_colours(config: Config, *, because: str) -> None:
-    """Refuse light of many colours, from a star of some size or that scintillates, and planes that a membrane moves.
-
-    For what knows only steady light of one colour, and planes at rest.
-
-    Args:
-        config: The settings.
-        because: What understands no more, as in `loop.sensor = "pyramid"`.
-
-    Raises:
-        SettingsError: If the settings ask for them.
-
-    Examples:
-        >>> refuse_colours(Config(), because="nlcwfs sensitivity")
-    """
-    if config.beam.spectrum.shape != "line":
-        raise SettingsError("beam.spectrum.shape", f'must be "line" with {because}', f'"{config.beam.spectrum.shape}"')
-    if config.atmosphere.star.size_mas:
-        raise SettingsError("atmosphere.star.size_mas", f"must be 0 with {because}", config.atmosphere.star.size_mas)
-    refuse_heights(config, because=because)
-    refuse_membrane(config, because=because)
-
-
-def refuse_membrane(config: Config, *, because: str) -> None:
-    """Refuse a membrane where planes rest, or where there are none.
-
-    Args:
-        config: The settings.
-        because: What has no such planes, as in `loop.sensor = "pyramid"`.
-
-    Raises:
-        SettingsError: If the settings ask for one.
-
-    Examples:
-        >>> refuse_membrane(Config(), because="nlcwfs sensitivity")
-    """
-    motion = config.curvature_sensor.membrane
-    if motion != "none":
-        raise SettingsError("curvature_sensor.membrane", f'must be "none" with {because}', f'"{motion}"')
 
 
 def _moments(config: Config) -> Moments:

@@ -17,11 +17,11 @@ from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.speckle_blur import blurred
-from nlcwfs.simulation.colours import refuse_colours
 from nlcwfs.simulation.exposure import distances_m, wavelength_m
 from nlcwfs.simulation.sensitivity import Optics
 from nlcwfs.simulation.sensitivity_settings import LightCells, SensitivityCase, SensitivityQuestion
 from nlcwfs.simulation.static_aberration import static_aberration
+from nlcwfs.simulation.steady_light import refuse_colours
 from nlcwfs.simulation.telescope import telescope
 
 

@@ -17,10 +17,10 @@ from nlcwfs.science.long_exposure import LongExposure
 from nlcwfs.simulation.closed_loop.lenslet_light import LensletOptics
 from nlcwfs.simulation.closed_loop.optics import CurvatureOptics, LoopOptics
 from nlcwfs.simulation.closed_loop.pyramid_light import PyramidOptics
-from nlcwfs.simulation.colours import refuse_colours, refuse_membrane
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator
 from nlcwfs.simulation.sequence import SCREEN_DIAMETERS, SequenceSimulator
 from nlcwfs.simulation.starlight import with_exposures_of
+from nlcwfs.simulation.steady_light import refuse_colours, refuse_membrane
 
 SHOWN_CYCLES = 40.0
 """Half width of the star's image in lambda / D."""

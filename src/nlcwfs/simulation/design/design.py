@@ -8,7 +8,6 @@ from nlcwfs.beam.sampling import SamplingNeed
 from nlcwfs.config import Config
 from nlcwfs.detector.read import Detector
 from nlcwfs.errors import SettingsError
-from nlcwfs.simulation.colours import refuse_colours
 from nlcwfs.simulation.design.blind_frequencies import blind_frequencies
 from nlcwfs.simulation.design.loop_errors import LoopErrors, Planes, best_rate_hz, loop_errors
 from nlcwfs.simulation.design.loop_residual import Loop, LoopResidual
@@ -26,6 +25,7 @@ from nlcwfs.simulation.design.plane_search import Tell, search_planes
 from nlcwfs.simulation.design.requirements import Wishes, check_possible, check_rms, first_rate_hz
 from nlcwfs.simulation.exposure import distances_m
 from nlcwfs.simulation.starlight import starlight_per_s
+from nlcwfs.simulation.steady_light import refuse_colours
 
 MODEL_CELLS_PER_CYCLE = 5.0
 """Cells of the reconstructor's model across the pupil for each cycle of the cutoff (study 08)."""
