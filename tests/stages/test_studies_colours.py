@@ -35,7 +35,7 @@ def test_errors_and_costs_are_drawn_over_those_of_one_wavelength():
     figure = draw_colours_for_lenses(table)
     assert figure is not None
     errors, cost = figure.axes
-    assert errors.get_title() == "300: 10.0 nm"
+    assert errors.get_title() == "300 nm rms: 10.0 nm in one wavelength"
     curves = {line.get_label(): np.asarray(line.get_xydata(), float) for line in errors.get_lines()}
     assert any(curve.shape == (2, 2) and np.allclose(curve, [[1, 2.0], [3, 1.2]]) for curve in curves.values())
     np.testing.assert_allclose(curves["40%, ideal lenses"], [[0.75, 1.1]])

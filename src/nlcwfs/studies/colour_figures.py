@@ -44,7 +44,7 @@ def _alone(table: Sequence[Row], group: str) -> list[Row]:
 
 def _errors(panel: Axes, rows: list[Row], alone: Row) -> None:
     without_nm = float(alone["median_pixels_nm"])
-    panel.set_title(f"{alone['case']}: {without_nm:.1f} nm".removeprefix("one-"), fontsize=10)
+    panel.set_title(f"{alone['group']} nm rms: {without_nm:.1f} nm in one wavelength", fontsize=10)
     panel.axhline(1, color="black", linewidth=1)
     for band, colour in BANDS.items():
         achromatic = _sorted(rows, band, "achromatic")
