@@ -17,7 +17,7 @@ LENSES = {"ideal": ("s", "ideal lenses"), "doublet": ("^", "doublet")}
 
 
 def draw_colours_for_lenses(table: Sequence[Row]) -> Figure | None:
-    """Error over that of one colour, and FFTs and time over those of its model, against colours in the model."""
+    """Error over that of one colour, and FFTs over those of its model, against colours in the model."""
     groups = [name for name in dict.fromkeys(str(row["group"]) for row in table) if _alone(table, name)]
     if not groups:
         return None
@@ -44,7 +44,7 @@ def _alone(table: Sequence[Row], group: str) -> list[Row]:
 
 def _errors(panel: Axes, rows: list[Row], alone: Row) -> None:
     without_nm = float(alone["median_pixels_nm"])
-    panel.set_title(f"{alone['case']}: {without_nm:.1f} nm".removeprefix("one-"), fontsize=10)
+    panel.set_title(f"{alone['group']} nm rms: {without_nm:.1f} nm in one wavelength", fontsize=10)
     panel.axhline(1, color="black", linewidth=1)
     for band, colour in BANDS.items():
         achromatic = _sorted(rows, band, "achromatic")
@@ -68,8 +68,7 @@ def _errors(panel: Axes, rows: list[Row], alone: Row) -> None:
 def _cost(panel: Axes, rows: list[Row], alone: Row) -> None:
     achromatic = _sorted(rows, 0.4, "achromatic")
     told = column(achromatic, "model_colours")
-    for key, marker, label in (("ffts", "o-", "FFTs"), ("ms_per_frame", "s--", "time")):
-        panel.plot(told, column(achromatic, key) / float(alone[key]), marker, color="black", label=label, markersize=4)
+    panel.plot(told, column(achromatic, "ffts") / float(alone["ffts"]), "o-", color="black", label="FFTs", markersize=4)
     panel.plot(told, told, ":", color="gray", label="wavelengths")
     panel.set_ylabel("over a model of one wavelength (band of 40 %)")
     panel.set_ylim(0)

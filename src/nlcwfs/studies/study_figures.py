@@ -56,7 +56,7 @@ FIGURES: Drawings = {
     "colours-for-lenses": (
         draw_colours_for_lenses,
         "Error over that in light of one wavelength with as many photons, against the wavelengths in the model: median "
-        "and 16 to 84 % of the skies. Right: FFTs and time of a frame, a band of 40 % without chromatic lenses.",
+        "and 16 to 84 % of the skies. Right: FFTs of a frame, a band of 40 % without chromatic lenses.",
     ),
     "calibration": (
         draw_calibration,
