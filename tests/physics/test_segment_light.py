@@ -103,3 +103,15 @@ def test_turns_far_and_near_are_seen_from_the_flat_wavefront():
         found, costs = look(light)
         best = np.asarray(found[int(jnp.argmin(costs))])
         np.testing.assert_allclose(best - best[0], turns, atol=0.02)  # the prior of pistons pulls a little
+
+
+def test_bright_light_in_single_precision_finds_its_turns():
+    """A common piston is told by the prior alone, a part in 1e9 of what the light tells of others."""
+    model = solver()
+    task, still = exposure(model, (0, 1, -1, 0), 2e8)
+    exact = SegmentLight.build(task, model.steps, still)
+    single = jax.tree.map(lambda one: one.astype(jnp.float32), exact)
+    start = jnp.asarray([0, 0.97, -1.02, 0], jnp.float32)
+    turns, cost = jax.jit(lambda light, start: light.fitted(start))(single, start)
+    np.testing.assert_allclose(np.asarray(turns - turns[0]), (0, 1, -1, 0), atol=0.005)
+    assert float(cost) < -1e5  # of 2e8 photons

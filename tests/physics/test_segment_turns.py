@@ -66,11 +66,14 @@ def trial(seed: int, photons: float) -> tuple[list[int], float]:
 
 @pytest.mark.parametrize("first", [0, 10])
 def test_whole_wavelengths_are_found_and_believed(first):
-    """1e5 photons; other turns are forty nats away and more, so none of twenty may be wrong."""
+    """1e5 photons; turns beside are forty nats away and more, so none of twenty may be wrong.
+
+    The seventh, on which a model of five colors shows its fringes again, is nearer: 13 nats in one of the trials.
+    """
     for seed in range(first, first + 10):
         turns, wrong = trial(seed, 1e5)
         assert turns == [0, 0, 0, 0]
-        assert 0 <= wrong < 1e-6
+        assert 0 <= wrong < 1e-4
 
 
 def test_one_color_tells_no_turns():

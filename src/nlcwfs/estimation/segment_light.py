@@ -24,6 +24,9 @@ from nlcwfs.estimation.segment_steps import SegmentSteps
 FITS = 4
 """Steps of Gauss and Newton to the nearest fringe: at most a quarter of a turn each."""
 
+UNSEEN = 1e-5
+"""Part of the mean curvature that holds pistons of segments that no light tells, for single precision."""
+
 
 class SegmentLight(eqx.Module):
     """Misfit of the counts, in nats, as a function of the pistons of the segments, near a wavefront that is known.
@@ -92,6 +95,8 @@ class SegmentLight(eqx.Module):
             seen = self.gram @ slopes
             uphill = seen.T @ (self._factors(now) - none) - self.pull @ slopes + (self.here + now) / self.rms**2
             curvature = slopes.T @ seen + jnp.eye(len(now), dtype=now.dtype) / self.rms**2
+            # No light tells a piston of all: it stays, or it were lost in the rounding of bright light.
+            curvature = curvature + jnp.trace(curvature) / len(now) * (1 + UNSEEN * jnp.eye(len(now), dtype=now.dtype))
             now = now - jnp.clip(jnp.linalg.solve(curvature, uphill), -0.25, 0.25)
             cost = self.cost(now)
             return now, jnp.where(cost < least, now, best), jnp.minimum(cost, least)
