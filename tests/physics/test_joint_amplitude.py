@@ -190,7 +190,7 @@ SOLVERS = {"known": solver("known"), "estimated": solver("estimated")}
 @pytest.mark.slow
 def test_with_much_light_the_amplitude_is_found_and_the_phase_is_better():
     joint, even = errors("estimated", 2e6), errors("known", 2e6)
-    # found: 2.6 to 3.7 nm in place of 14 to 19, 0.15 of the amplitude missed
+    # found: 2.7 to 3.4 nm in place of 14 to 19, 0.15 of the amplitude missed
     assert np.all(joint[:, 0] < 0.35 * even[:, 0])
     assert np.all(joint[:, 1] < 0.25)
     assert np.all(joint[:, 2] > 0.97)
@@ -199,5 +199,5 @@ def test_with_much_light_the_amplitude_is_found_and_the_phase_is_better():
 @pytest.mark.slow
 def test_with_little_light_it_does_not_hurt():
     joint, even = errors("estimated", 2e3), errors("known", 2e3)
-    assert np.all(joint[:, 0] < 1.02 * even[:, 0])  # found: 0.83 to 0.94
+    assert np.all(joint[:, 0] < 1.02 * even[:, 0])  # found: 0.94 to 0.99
     assert np.all((joint[:, 1] < 1) & (joint[:, 2] > 0.2))
