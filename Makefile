@@ -48,6 +48,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs sensitivity studies/09-one-family
 	$(BIN)/nlcwfs sweep studies/10-colour-loop
 	$(BIN)/nlcwfs study studies/11-sparse-pupil
+	$(BIN)/nlcwfs study studies/15-any-pupil
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructors against that of their own FFTs, and of a frame of the loop

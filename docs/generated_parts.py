@@ -20,6 +20,7 @@ STUDIES = (
     "09-one-family",
     "10-colour-loop",
     "11-sparse-pupil",
+    "15-any-pupil",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 

@@ -128,12 +128,12 @@ def test_a_point_that_kills_its_workers_fails_alone(tmp_path, monkeypatch):
 
 def test_a_scheduler_that_goes_away_ends_the_sweep_in_a_line(tmp_path, scheduler):
     address, process = scheduler
-    folder = written(tmp_path / "s", THREE)
+    folder = written(tmp_path / "s", f"[grid]\nseed = {list(range(60))}\n")  # not over before it goes, however late
     with worker(address):
         sweeping = Sweeping(folder, "--scheduler", address)
-        sweeping.read_until("[1/3]")
+        sweeping.read_until("[1/60]")
         process.kill()
-        assert sweeping.end() == 2
+        assert sweeping.end() == 2, sweeping.said
     assert "the scheduler must stay until the end, got no answer from it any more" in sweeping.said
     assert "Traceback" not in sweeping.said
-    assert [row["outcome"] for row in rows_in(folder).values()] == ["closed"]
+    assert 1 <= len(rows_in(folder)) < 60

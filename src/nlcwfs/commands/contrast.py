@@ -65,7 +65,7 @@ def contrast_of_loop(config: Config, out: Path, *, quiet: bool) -> None:
     if config.loop.sensor == "shack-hartmann":
         raise SettingsError("loop.sensor", "must be curvature or ideal for the halo of a loop", config.loop.sensor)
     if config.beam.pupil_map is not None:
-        raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
+        raise SettingsError("beam.pupil_map", "must be left out of a contrast", config.beam.pupil_map)
     study = ContrastStudy.of(config)
     _prepare(out)
     before = read_table(out / LOOPS, NEEDED)

@@ -20,9 +20,10 @@ from nlcwfs.commands.console import (
 )
 from nlcwfs.commands.loop_keeping import Checkpoints, kept
 from nlcwfs.config import Config
-from nlcwfs.errors import FileFormatError, SettingsError
+from nlcwfs.errors import FileFormatError
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
 from nlcwfs.simulation.closed_loop.run import run_loop, summary
 from nlcwfs.simulation.colours import colour_account
@@ -40,13 +41,11 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
     Raises:
         NlcwfsError: If settings contradict each other or the folder cannot be used.
     """
-    if config.beam.pupil_map is not None:
-        raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
     use_precision(config.precision)
     folder_of.prepare_folder(out, config, resume=resume)
     stopped = folder_of.read_checkpoint(out, config) if resume else None
     say("Making the air, the mirror and the reconstructor ...", quiet=quiet)
-    running = Loop.build(config)
+    running = Loop.build(config, pupil_of(config))
     for line in colour_account(config, running.light.still.air):
         say(line, quiet=quiet)
     state, records = stopped or (None, None)

@@ -10,6 +10,7 @@ from nlcwfs.beam.modes import ModalBasis, modal_basis
 from nlcwfs.config import Config
 from nlcwfs.detector.pixels import integrate_on_pixels
 from nlcwfs.estimation.photon_bound import fisher_information, photon_bound
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key, turbulence, wavelength_m
 
 SCREENS = 2
@@ -42,7 +43,7 @@ class LightInformation(NamedTuple):
 def light_information(config: Config) -> LightInformation:
     """What one photon tells about the modes; photon noise alone, so that it serves for any number of photons."""
     simulation = config.simulation.model_copy(update={"light_oversampling": OVERSAMPLING})
-    simulator = ExposureSimulator.build(config.model_copy(update={"simulation": simulation}))
+    simulator = ExposureSimulator.build(config.model_copy(update={"simulation": simulation}), pupil_of(config))
     size = simulator.light.shape[0]
     margin = (size - int(np.ceil(simulator.shape.diameter_m / simulator.light.pixel_m)) - 2) // 2
     tight = slice(margin, size - margin)

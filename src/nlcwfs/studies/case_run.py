@@ -21,6 +21,7 @@ from nlcwfs.estimation.settings import EstimationSettings
 from nlcwfs.estimation.unwrapping_basis import unwrapping_basis
 from nlcwfs.estimation.wavefront_estimate import WavefrontEstimate
 from nlcwfs.interop.frames_reconstruction import rms_m
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.exposure import ExposureSimulator, seeing_arcsec, turbulence, wavelength_m
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.score import wavefront_error_m
@@ -65,7 +66,7 @@ class Scored(NamedTuple):
 
 def build_solver(case: Case, config: Config) -> tuple[Reconstructor, SensorGeometry]:
     """The reconstructor of a case, and what it knows of the sensor."""
-    simulator = ExposureSimulator.build(config)
+    simulator = ExposureSimulator.build(config, pupil_of(config))
     geometry, settings = geometry_of(config, simulator), config.estimation
     if case.strength == "known":
         settings = settings.model_copy(update={"seeing_arcsec": seeing_arcsec(simulator.air)})

@@ -13,6 +13,7 @@ from nlcwfs.config import Config, digest
 from nlcwfs.errors import NlcwfsError
 from nlcwfs.interop import Provenance
 from nlcwfs.interop import loop_folder as folder_of
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
 from nlcwfs.simulation.closed_loop.run import LoopTelemetry, counted_from, run_loop, summary
 from nlcwfs.simulation.closed_loop.seed import reseeded
@@ -67,7 +68,7 @@ class PointRunner:
             self._loop = None
             jax.clear_caches()  # else a long sweep would fill the memory with compiled code
         if self._loop is None:
-            self._family, self._loop = family, Loop.build(config)
+            self._family, self._loop = family, Loop.build(config, pupil_of(config))
         return self._loop if self._loop.config.seed == config.seed else reseeded(self._loop, config.seed)
 
 

@@ -14,6 +14,7 @@ from nlcwfs.beam.pupil import light_weights
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.defocused_images import CurvatureSensor
 from nlcwfs.detector.pixels import integrate_on_pixels
+from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.exposure import ExposureSimulator, frame_key
 from nlcwfs.simulation.known_sensor import geometry_of
 from nlcwfs.simulation.segment_score import segment_pixels
@@ -62,7 +63,7 @@ class Light(NamedTuple):
 
 def make_light(case: Case, config: Config, count: int, progress: Progress) -> Light:
     """Expose the detector to `count` skies."""
-    simulator = ExposureSimulator.build(config)
+    simulator = ExposureSimulator.build(config, pupil_of(config))
     cut = lit_part(np.asarray(simulator.weights))
     weights = np.asarray(simulator.weights, float)[cut]
     grid = simulator.light.padded(weights.shape)

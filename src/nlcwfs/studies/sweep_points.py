@@ -189,8 +189,6 @@ def _points(path: Path, sweep: Sweep) -> Iterator[Point]:
 def _point(sweep: Sweep, case: SweepCase, file: Path | None, chosen: dict[str, Any]) -> Point:
     assigned = [f"{key}={toml_value(value)}" for key, value in chosen.items()]
     config = load_config(file, [*sweep.set, *case.set, *assigned])
-    if config.beam.pupil_map is not None:
-        raise SettingsError("beam.pupil_map", "must be left out for a loop", config.beam.pupil_map)
     keep = sweep.keep if case.keep is None else case.keep
     name = ",".join([case.name, *(f"{key}={_in_name(value)}" for key, value in chosen.items())])
     columns = {key: told for key in sweep.varied() if (told := _told(config, key, chosen)) is not None}

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nlcwfs.beam.grid import Grid
+from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.beam.zernike import zernikes
 from nlcwfs.config import Config
 from nlcwfs.curvature_sensor.settings import CurvatureSensorSettings
@@ -60,20 +61,24 @@ class LoopLight(eqx.Module):
     reference_m: Float[Array, "lit_y lit_x"]
 
     @classmethod
-    def build(cls, config: Config) -> "LoopLight":
+    def build(cls, config: Config, pupil: PupilShape | None = None) -> "LoopLight":
         """Draw the air and make the mirror.
+
+        Args:
+            config: The settings.
+            pupil: Its shape, as for `ExposureSimulator.build`.
 
         Raises:
             SettingsError: If settings contradict each other, or the air would repeat before the end.
             SamplingError: If the pupil does not fit in the window, or the mirror's shapes are too fine for the light.
         """
-        sequence = SequenceSimulator.build(sequence_config(config))
+        sequence = SequenceSimulator.build(sequence_config(config), pupil)
         still = sequence.still
         cut = still.screens.low_waves_y.shape[1], still.screens.low_waves_x.shape[1]
-        pupil, part = _middle(still.shape.on(still.light), cut), Grid(cut, still.light.pixel_m)
+        amplitude, part = _middle(still.shape.on(still.light), cut), Grid(cut, still.light.pixel_m)
         diameter_m = config.beam.diameter_m
         dtype = str(still.weights.dtype)
-        mirror = Mirror.build(config.mirror, pupil, part, diameter_m=diameter_m, dtype=dtype)
+        mirror = Mirror.build(config.mirror, amplitude, part, diameter_m=diameter_m, dtype=dtype)
         weights = _middle(np.asarray(still.weights, float), cut)
         optics = CurvatureOptics(still)
         if config.loop.sensor in ("shack-hartmann", "pyramid"):

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from nlcwfs.beam.grid import Grid
 from nlcwfs.beam.modes import ModalBasis, modal_basis
+from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.estimation.outcome import Outcome
@@ -88,8 +89,12 @@ class Loop:
         self._groups = jax.jit(self._group_squares)
 
     @classmethod
-    def build(cls, config: Config) -> "Loop":
+    def build(cls, config: Config, pupil: PupilShape | None = None) -> "Loop":
         """Prepare everything.
+
+        Args:
+            config: The settings.
+            pupil: Its shape, as for `ExposureSimulator.build`.
 
         Raises:
             SettingsError: If settings contradict each other.
@@ -100,7 +105,7 @@ class Loop:
         if blur_m > config.beam.diameter_m / 4:
             rule = "must be higher, or loop.substeps: the air moves more than a quarter of the telescope in a moment"
             raise SettingsError("loop.rate_hz", rule, f"{config.loop.rate_hz:g}")
-        light = LoopLight.build(config)
+        light = LoopLight.build(config, pupil)
         controller = Controller.build(config.feedback, light.mirror.count, config.loop.rate_hz)
         return cls(config, light=light, measurement=build_sensor(config, light), controller=controller)
 

@@ -16,7 +16,7 @@ def reseeded(loop: Loop, seed: int) -> Loop:
     Equal to a loop that is built with that seed: what the controller of the first has learnt is not handed on.
     """
     config = loop.config.model_copy(update={"seed": seed})
-    air = SequenceSimulator.build(sequence_config(config))
+    air = SequenceSimulator.build(sequence_config(config), loop.light.still.shape)
     other = copy.copy(loop)
     other.config = config
     other.light = eqx.tree_at(lambda light: light.sequence, loop.light, air)
