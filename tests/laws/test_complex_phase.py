@@ -112,7 +112,7 @@ def test_the_jacobian_of_both_is_that_of_finite_differences_and_its_transpose_th
     step = 1e-5  # its cube leaves 1e-10 of the change, rounding 1e-11
     ahead, behind = (case.seen_through(case.both + sign * step * change) for sign in (1, -1))
     np.testing.assert_allclose(found, (ahead - behind) / (2 * step), atol=2 * POLYNOMIAL * abs(found).max())
-    size = np.linalg.norm(found) * np.linalg.norm(weights)
+    size = float(np.linalg.norm(found) * np.linalg.norm(weights))
     assert np.sum(found * weights) == pytest.approx(np.sum(change * back), abs=1e-13 * size)
     assert abs(found).max() > 1
     assert np.linalg.norm(back[:, case.pupil == 0]) == 0  # where no light is, no count knows
