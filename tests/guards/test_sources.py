@@ -45,6 +45,8 @@ WITHOUT_EXAMPLE = {
     "nlcwfs.simulation.closed_loop.spots_air:finer_rad2": "the same",
     "nlcwfs.simulation.closed_loop.spots_air:coarser": "the same",
     "nlcwfs.estimation.turn_islands:torn_phase": "needs a sensor and its light",
+    "nlcwfs.estimation.segment_light:interference": "needs a sensor of segments and its light",
+    "nlcwfs.estimation.segment_turns:looked": "the same",
     "nlcwfs.interop.frames_fits:write_frames": "needs a folder; docs/your-own-frames.md shows it",
     "nlcwfs.interop.wavefront_fits:read_wavefront": "needs a file; the example is that of writing",
     "nlcwfs.interop.loop_folder:prepare_folder": "needs a folder; `nlcwfs loop` shows it",
