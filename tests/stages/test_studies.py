@@ -165,8 +165,8 @@ def real(tmp_path_factory):
     written(folder, "\n".join(lines))
     lights, errors_m, progress = [], [], []
 
-    def light(*arguments):
-        lights.append(make_light(*arguments))
+    def light(*arguments, **air):
+        lights.append(make_light(*arguments, **air))
         return lights[-1]
 
     def error_m(*arguments):
@@ -388,7 +388,7 @@ class Bench:
         monkeypatch.setattr(study_run, "make_light", self.make_light)
         monkeypatch.setattr(study_run, "run_case", self.run_case)
 
-    def make_light(self, case, config, count, progress):
+    def make_light(self, case, config, count, progress, *, air=None):
         self.lights.append((case.name, count))
         return Light([], Grid((2, 2), 1.0), np.ones((2, 2)), np.ones((2, 2)))
 
