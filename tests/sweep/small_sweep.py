@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from tests.loop.small_loop import SMALL
@@ -69,7 +70,15 @@ class Sweeping:
         return self.process.returncode
 
     def left_over(self) -> list[int]:
-        """Processes of the group that still live."""
+        """Processes of the group that still live, after some time to go."""
+        for _ in range(100):
+            alive = self._alive()
+            if not alive:
+                break
+            time.sleep(0.1)
+        return alive
+
+    def _alive(self) -> list[int]:
         listed = subprocess.run(["ps", "-eo", "pid,pgid,stat"], capture_output=True, text=True, check=True).stdout
         rows = [line.split() for line in listed.splitlines()[1:]]
         return [int(pid) for pid, group, stat in rows if int(group) == self.process.pid and not stat.startswith("Z")]

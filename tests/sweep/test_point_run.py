@@ -70,7 +70,7 @@ def test_a_row_holds_the_numbers_of_the_loop(tmp_path):
 def test_a_mirror_serves_all_seeds_and_no_other_setting(tmp_path, monkeypatch):
     points = points_of(tmp_path, "[grid]\nmirror.cutoff_cpa = [5, 4]\nseed = [0, 1]\n")
     build, built = Loop.build, []
-    monkeypatch.setattr(point_run.Loop, "build", lambda config: built.append(config) or build(config))
+    monkeypatch.setattr(point_run.Loop, "build", lambda config, pupil: built.append(config) or build(config, pupil))
     runner = PointRunner()
     rows = [runner.run(point).row for point in points[:3]]
     assert [config.mirror.cutoff_cpa for config in built] == [5, 4]

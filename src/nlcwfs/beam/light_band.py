@@ -113,7 +113,7 @@ class LightBand:
 
         Examples:
             >>> band = LightBand.flat(wavelength_m=0.85e-6, bandwidth_m=0.34e-6)
-            >>> round(1e6 * band.effective_m, 4), round(0.34 / np.log(1.02 / 0.68), 4)
+            >>> round(1e6 * band.effective_m, 4), round(0.34 / math.log(1.02 / 0.68), 4)
             (0.8385, 0.8385)
         """
         return float(1 / (self.shares @ (1 / self.wavelengths_m)))

@@ -1,11 +1,11 @@
 """The frames of a sensor, with all that a reconstructor must know about them."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nlcwfs.curvature_sensor.membrane import Motion
 from nlcwfs.errors import SettingsError
 
 
@@ -65,7 +65,7 @@ class FramesFile:
     obstruction_ratio: float = 0.0
     bandwidth_m: float = 0.0
     chromatic_lenses: bool = False
-    membrane: Motion = "none"
+    membrane: Literal["none", "sine", "square"] = "none"
     membrane_dead_share: float = 0.0
     gain_electrons_per_adu: float | None = None
     read_noise_electrons: float = 0.0

@@ -145,7 +145,8 @@ def _panel(panel: Axes, table: Sequence[Row], effect: str, rms: str) -> None:
             panel.plot(told.strength, told.expected, ":", color=colour, lw=1.4)
     panel.axhline(ALLOWED, color="gray", linewidth=0.8)
     panel.grid(alpha=0.3)
-    panel.legend(fontsize=7, loc="upper left")
+    if panel.get_legend_handles_labels()[0]:
+        panel.legend(fontsize=7, loc="upper left")
 
 
 def _parts(row: Row) -> list[str]:
