@@ -52,6 +52,7 @@ studies: $(VENV)/.installed-dev  ## The stored studies again, and the tests that
 	$(BIN)/nlcwfs study studies/13-no-chromatic-lenses
 	$(BIN)/nlcwfs study studies/14-sky-budgets
 	$(BIN)/nlcwfs study studies/15-any-pupil
+	$(BIN)/nlcwfs sweep studies/16-loop-on-the-sky
 	$(SINGLE_THREAD) $(BIN)/pytest -n $(WORKERS) --dist loadfile -q -m slow
 
 bench: $(VENV)/.installed  ## Time of the reconstructors against that of their own FFTs, and of a frame of the loop

@@ -24,6 +24,7 @@ STUDIES = (
     "13-no-chromatic-lenses",
     "14-sky-budgets",
     "15-any-pupil",
+    "16-loop-on-the-sky",
 )
 PENDING = "The table of this study is not stored yet: `make studies` computes it.\n"
 

@@ -170,7 +170,7 @@ class AtmosphereSettings(BaseModel):
         min_length=1,
         examples=[(10.0,)],
         description="height of each layer above the telescope, whose air then changes the amplitude, too "
-        "(scintillation, in single exposures); leave out for 0",
+        "(scintillation); leave out for 0",
     )
     wind_speeds_m_per_s: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = Field(
         default=(10.0,), min_length=1, description="speed of the wind in each layer"

@@ -94,7 +94,7 @@ class HighAir(eqx.Module):
                 layer is so high that its light comes from beyond the widest screen.
         """
         shape, pixel_m = grid
-        _check_layers(air, heights_m, fractions, min(wavelengths_m))
+        check_layers(air, heights_m, fractions, min(wavelengths_m))
         period = _period(max(heights_m), max(wavelengths_m), max(shape), pixel_m)
         screens = PhaseScreens.build(air, shape=shape, pixel_m=pixel_m, period=period, dtype=dtype)
         kind, power = np.result_type(dtype, np.complex64), np.asarray(screens.amplitude_m, float) ** 2
@@ -139,8 +139,21 @@ class HighAir(eqx.Module):
         return AirAtPupil(opd_m, jax.lax.complex(amplitude[1:] * jnp.cos(turned), amplitude[1:] * jnp.sin(turned)))
 
 
-def _check_layers(air: Turbulence, heights_m: Sequence[float], fractions: Sequence[float], shortest_m: float) -> None:
-    """Refuse layers that are not there, and air that is too strong."""
+def check_layers(air: Turbulence, heights_m: Sequence[float], fractions: Sequence[float], shortest_m: float) -> None:
+    """Refuse layers that are not there, and air that is too strong.
+
+    Args:
+        air: The whole turbulence.
+        heights_m: Height of each layer.
+        fractions: Share of each layer in the turbulence.
+        shortest_m: The shortest wavelength.
+
+    Raises:
+        SettingsError: If heights do not fit the layers or are negative, or if the scintillation is not weak.
+
+    Examples:
+        >>> check_layers(Turbulence.from_seeing(seeing_arcsec=0.6), (0.0, 10e3), (0.5, 0.5), 0.85e-6)
+    """
     shown = [height_m / 1e3 for height_m in heights_m]
     if len(shown) != len(fractions):
         raise SettingsError("atmosphere.layer_heights_km", f"must be one per layer, {len(fractions)}", shown)

@@ -27,6 +27,7 @@ from nlcwfs.interop.simulated_frames import pupil_of
 from nlcwfs.simulation.closed_loop.loop import Loop, LoopState, Record
 from nlcwfs.simulation.closed_loop.run import run_loop, summary
 from nlcwfs.simulation.colours import colour_account
+from nlcwfs.simulation.scintillation import scintillation_account
 
 CHECKPOINT_EVERY_S = 20.0
 """Time between two checkpoints, in seconds of the computation."""
@@ -46,7 +47,8 @@ def loop(config: Config, out: Path, *, resume: bool, quiet: bool) -> int:
     stopped = folder_of.read_checkpoint(out, config) if resume else None
     say("Making the air, the mirror and the reconstructor ...", quiet=quiet)
     running = Loop.build(config, pupil_of(config))
-    for line in colour_account(config, running.light.still.air):
+    air, log_variance = running.light.still.air, running.light.sequence.log_variance
+    for line in [*colour_account(config, air), *scintillation_account(config, air, log_variance)]:
         say(line, quiet=quiet)
     state, records = stopped or (None, None)
     if records:

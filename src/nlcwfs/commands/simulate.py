@@ -79,7 +79,8 @@ def simulate(config: Config, options: SimulateOptions) -> None:
     write_frames(options.out, frames, stamp, unit="adu" if options.adu else "electron")
     for warning in [*warnings, *EXCESS_NOISE[: config.detector.em_gain > 1]]:
         warn(warning)
-    for line in [*account(config, simulator, shots, frames), *(sequence_account(config, sequence) if sequence else [])]:
+    moved = [] if sequence is None else sequence_account(config, sequence)
+    for line in [*account(config, sequence or simulator, shots, frames), *moved]:
         say(line, quiet=options.quiet)
     say(f"Wrote {options.out} ({'adu' if options.adu else 'electrons'}, {dtype_name}).", quiet=options.quiet)
 
@@ -199,8 +200,11 @@ def sequence_account(config: Config, sequence: SequenceSimulator) -> list[str]:
     ]
 
 
-def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot], frames: FramesFile) -> list[str]:
+def account(
+    config: Config, light: ExposureSimulator | SequenceSimulator, shots: Sequence[Shot], frames: FramesFile
+) -> list[str]:
     """What was made, a line for each thing that a user may want to know."""
+    simulator = light.still if isinstance(light, SequenceSimulator) else light
     count, planes, rows, columns = frames.electrons.shape
     pupil = simulator.shape.on(simulator.frame)
     weights = light_weights(np.where(inside(pupil), pupil, 0))
@@ -218,7 +222,7 @@ def account(config: Config, simulator: ExposureSimulator, shots: Sequence[Shot],
         f"{electrons:.0f} electrons were read.",
         *colour_account(config, simulator.air),
         f"Air: D/r0 = {ratio:.1f} at {colour}; seeing {frames.seeing_arcsec:.2g} arcsec at 0.5 um.",
-        *scintillation_account(config, simulator.air, simulator.high),
+        *scintillation_account(config, simulator.air, light.log_variance),
         f"True wavefront: {np.sqrt(np.mean(np.square(rms_nm))):.0f} nm rms on these pixels, tilt included{spread}.",
         f"Light outside the window: {', '.join(percent(float(share)) for share in lost)} of planes 1 to {planes}.",
         *([f"Static aberration: {static_nm:g} nm rms; TRUTH holds it, too."] if static_nm else []),

@@ -140,6 +140,11 @@ class ExposureSimulator(eqx.Module):
         )
 
     @property
+    def log_variance(self) -> float | None:
+        """Variance of the logarithm of the amplitude at the wavelength of sensing; None in even light."""
+        return None if self.high is None else float(self.high.log_variance[0])
+
+    @property
     def frame(self) -> Grid:
         """The pixels of one plane of the detector."""
         return Grid(self.window, self.light.pixel_m * self.factor)

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 
+from nlcwfs.atmosphere.frozen_flow import FrozenFlow
 from nlcwfs.atmosphere.phase_screen import Turbulence
 from nlcwfs.atmosphere.scintillation import scintillation_index
-from nlcwfs.beam.air_at_pupil import HighAir
+from nlcwfs.beam.air_at_pupil import HighAir, check_layers
+from nlcwfs.beam.moving_air_at_pupil import Twinkling, at_pupil
 from nlcwfs.beam.spectrum import Spectrum
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
@@ -44,20 +46,66 @@ def high_air(
     )
 
 
-def scintillation_account(config: Config, air: Turbulence, high: HighAir | None) -> list[str]:
+def high_flow(
+    config: Config, air: Turbulence, flow: FrozenFlow, *, pixel_m: float
+) -> tuple[FrozenFlow, Twinkling | None]:
+    """Moving air as it is at the pupil, and the amplitude that it makes; unchanged and None where all is at the pupil.
+
+    Args:
+        config: The settings.
+        air: The whole turbulence.
+        flow: Its layers where they are.
+        pixel_m: Width of a pixel of the flow.
+
+    Raises:
+        SettingsError: If heights do not fit the layers, the scintillation is not weak, or the light has many colours.
+
+    Examples:
+        >>> from nlcwfs.config import load_config
+        >>> from nlcwfs.simulation.sequence import SequenceSimulator
+        >>> small = ["detector.pixels_across_pupil=12", "detector.window_pixels=16", "simulation.rate_hz=500"]
+        >>> sequence = SequenceSimulator.build(load_config(None, small))
+        >>> high_flow(Config(), sequence.still.air, sequence.flow, pixel_m=0.1)[1] is None
+        True
+    """
+    heights_m, wavelength_m = config.atmosphere.heights_m, config.beam.wavelength_um * 1e-6
+    if not heights_m:
+        return flow, None
+    if config.beam.spectrum.shape != "line":
+        refuse_heights(config, because="light of many colours in sequences and loops")
+    check_layers(air, heights_m, config.atmosphere.layer_fractions, wavelength_m)
+    return at_pupil(flow, heights_m=heights_m, wavelength_m=wavelength_m, pixel_m=pixel_m)
+
+
+def without_heights(config: Config) -> Config:
+    """The same with all the air at the telescope.
+
+    Examples:
+        >>> without_heights(Config()) == Config()
+        True
+    """
+    return config.model_copy(update={"atmosphere": config.atmosphere.model_copy(update={"layer_heights_km": None})})
+
+
+def scintillation_account(config: Config, air: Turbulence, log_variance: float | None) -> list[str]:
     """How strong it is and where it comes from, in a line; nothing where there is none.
+
+    Args:
+        config: The settings.
+        air: The whole turbulence.
+        log_variance: Variance of the logarithm of the amplitude of the cells of the light; None where nothing twinkles.
 
     Examples:
         >>> scintillation_account(Config(), Turbulence.from_seeing(seeing_arcsec=0.6), None)
         []
     """
-    if high is None:
+    if log_variance is None:
         return []
-    sky, wavelength_m, diameter_m = config.atmosphere, high.wavelengths_m[0], config.beam.diameter_m
+    sky, wavelength_m, diameter_m = config.atmosphere, config.beam.wavelength_um * 1e-6, config.beam.diameter_m
     of_layers = (air, sky.heights_m, sky.layer_fractions)
     point = scintillation_index(*of_layers, wavelength_m=wavelength_m)
     whole = math.sqrt(scintillation_index(*of_layers, wavelength_m=wavelength_m, diameter_m=diameter_m))
-    cells = math.expm1(4 * float(high.log_variance[0]))
+    cells = math.expm1(4 * log_variance)
     ratio = diameter_m / air.fried_at(wavelength_m)
     layers = ", ".join(
         f"{ratio * fraction**0.6:.1f} at {height_m / 1e3:g} km"

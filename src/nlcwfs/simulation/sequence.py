@@ -10,11 +10,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from nlcwfs.atmosphere.frozen_flow import TAPS, FrozenFlow, WindLayer, unrepeated_s
 from nlcwfs.atmosphere.phase_screen import PhaseScreens
+from nlcwfs.beam.moving_air_at_pupil import Twinkling
 from nlcwfs.beam.pupil_shape import PupilShape
 from nlcwfs.config import Config
 from nlcwfs.errors import SettingsError
 from nlcwfs.simulation.exposure import Exposure, ExposureSimulator, frame_key
-from nlcwfs.simulation.scintillation import refuse_heights
+from nlcwfs.simulation.scintillation import high_flow, without_heights
 
 SCREEN_DIAMETERS = 12
 """Width of the air in diameters of the telescope; 8 m and 10 m/s give 9 s, and Table 1 a screen of 75 MB."""
@@ -35,7 +36,8 @@ class SequenceSimulator(eqx.Module):
 
     Attributes:
         still: The sensor, and what makes one exposure.
-        flow: The air.
+        flow: The air, as it is at the pupil.
+        twinkling: The amplitude that it makes there; None where all of it is at the telescope.
         rate_hz: Exposures in a second.
         substeps: Moments of an exposure.
         seed: Of air and noise.
@@ -53,6 +55,7 @@ class SequenceSimulator(eqx.Module):
     rate_hz: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
+    twinkling: Twinkling | None = None
 
     @classmethod
     def build(cls, config: Config, pupil: PupilShape | None = None) -> "SequenceSimulator":
@@ -64,14 +67,13 @@ class SequenceSimulator(eqx.Module):
 
         Raises:
             SettingsError: If there is no rate, if the air would repeat before the last frame, if segments do not stand
-                still, or if settings contradict each other.
+                still, if layers at altitude cannot be served, or if settings contradict each other.
             SamplingError: If the pupil does not fit in the window.
         """
         rate_hz = config.simulation.rate_hz
         if rate_hz is None:
             raise SettingsError("simulation.rate_hz", "must be given for a sequence (--rate HZ)", "nothing")
-        refuse_heights(config, because="sequences and loops: only single exposures scintillate yet")
-        still = ExposureSimulator.build(config, pupil)
+        still = ExposureSimulator.build(without_heights(config), pupil)
         if still.stand is not None:
             rule = "must have no pistons and tilts in a sequence or a loop: only single exposures know them yet"
             raise SettingsError("beam.segments", rule, config.beam.segments.layout)
@@ -80,12 +82,15 @@ class SequenceSimulator(eqx.Module):
         _check_duration(config, unrepeated_s(layers, shape=shape, pixel_m=pixel_m, period=period), rate_hz)
         dtype, key = str(still.weights.dtype), jax.random.fold_in(jax.random.key(config.seed), AIR)
         screens = PhaseScreens.build(still.air, shape=shape, pixel_m=pixel_m, period=period, dtype=dtype)
+        flow = FrozenFlow.build(screens, layers, key, duration_s=config.simulation.frames / rate_hz)
+        flow, twinkling = high_flow(config, still.air, flow, pixel_m=pixel_m)
         return cls(
             still=still,
-            flow=FrozenFlow.build(screens, layers, key, duration_s=config.simulation.frames / rate_hz),
+            flow=flow,
             rate_hz=rate_hz,
             substeps=config.simulation.substeps,
             seed=config.seed,
+            twinkling=twinkling,
         )
 
     @property
@@ -97,6 +102,17 @@ class SequenceSimulator(eqx.Module):
         """When the light of an exposure is computed; frame 0 begins at 0."""
         middle = (jnp.arange(self.substeps, dtype=self.still.weights.dtype) + 0.5) / self.substeps
         return (jnp.asarray(frame, middle.dtype) + middle) / self.rate_hz
+
+    @property
+    def log_variance(self) -> float | None:
+        """Variance of the logarithm of the amplitude; None in even light."""
+        return None if self.twinkling is None else float(self.twinkling.variance)
+
+    def factor(self, moment_s: Float[Array, ""]) -> Float[Array, "1 Y X"] | None:
+        """What else multiplies the field at the pupil at a moment, on the grid of the light; None in even light."""
+        if self.twinkling is None:
+            return None
+        return self.still.on_light(self.twinkling.amplitude(moment_s))[None]
 
     def expose(self, frame: int) -> Exposure:
         """One exposure of the sequence, counted from 0."""
@@ -111,7 +127,7 @@ class SequenceSimulator(eqx.Module):
             sums: tuple[Float[Array, "Y X"], Float[Array, "plane Y X"]], moment_s: Float[Array, ""]
         ) -> tuple[tuple[Float[Array, "Y X"], Float[Array, "plane Y X"]], None]:
             opd_m = still.levelled(still.on_light(self.flow.opd_m(moment_s)))
-            planes = still.sensor.images(opd_m, share * still.photons).photons
+            planes = still.sensor.images(opd_m, share * still.photons, factor=self.factor(moment_s)).photons
             return (sums[0] + share * opd_m, sums[1] + planes), None
 
         shape, dtype = still.sensor.transfer.shape[1:], still.weights.dtype

@@ -137,7 +137,7 @@ class LoopLight(eqx.Module):
             opd_m = self.sequence.flow.opd_m(moment[0]) + bump_m - moment[1] * before_m - (1 - moment[1]) * after_m
             opd_m = jnp.where(self.weights > 0, opd_m - jnp.sum(self.weights * opd_m), 0)
             whole_m = still.on_light(opd_m)
-            images = self.optics.images(opd_m, share * still.photons)
+            images = self._images(opd_m, share * still.photons, moment[0])
             left_m = opd_m - self.reference_m
             square = jnp.sum(self.weights * left_m**2)
             return (sums[0] + whole_m * share, sums[1] + images, sums[2] + square * share, sums[3].add(left_m)), None
@@ -149,6 +149,15 @@ class LoopLight(eqx.Module):
         (opd_m, images, square, image), _ = jax.lax.scan(add, none, (moments_s, early))
         key = jax.random.split(jax.random.fold_in(jax.random.key(self.sequence.seed), frame))[1]
         return Corrected(self.optics.read(opd_m, images, key), square, image)
+
+    def _images(
+        self, opd_m: Float[Array, "lit_y lit_x"], photons: float, moment_s: Float[Array, ""]
+    ) -> Float[Array, "image v u"]:
+        """Of a moment; other sensors than the curvature sensor refuse air that twinkles."""
+        factor = self.sequence.factor(moment_s)
+        if factor is None or not isinstance(self.optics, CurvatureOptics):
+            return self.optics.images(opd_m, photons)
+        return self.optics.images(opd_m, photons, factor=factor)
 
     def _share_before(self, share: float) -> Float[Array, " substep"]:
         """For each moment, the part of its time with the earlier command on the mirror."""

@@ -40,9 +40,11 @@ class CurvatureOptics(eqx.Module):
 
     still: ExposureSimulator
 
-    def images(self, opd_m: Float[Array, "lit_y lit_x"], photons: float) -> Float[Array, "image v u"]:
-        """Photons of one moment, see `LoopOptics`."""
-        return self.still.sensor.images(self.still.on_light(opd_m), photons).photons
+    def images(
+        self, opd_m: Float[Array, "lit_y lit_x"], photons: float, *, factor: Float[Array, "1 Y X"] | None = None
+    ) -> Float[Array, "image v u"]:
+        """Photons of one moment, see `LoopOptics`; and `CurvatureSensor.images` for the factor."""
+        return self.still.sensor.images(self.still.on_light(opd_m), photons, factor=factor).photons
 
     def read(self, opd_m: Float[Array, "Y X"], images: Float[Array, "image v u"], key: PRNGKeyArray) -> Exposure:
         """What the detector reads of the sum, see `LoopOptics`."""
