@@ -88,7 +88,6 @@ def test_frames_are_written_and_the_scintillation_is_told(tmp_path):
         ),
         ("simulate", ["layer_heights_km=[0, -1]"], "layer_heights_km[1]: must be a number from 0 to 100 [km], got -1"),
         ("simulate", ["opd_rms_nm=600", "layer_heights_km=[0, 100]"], "layer_heights_km: must leave the scintillation"),
-        ("loop", ["layer_heights_km=[0, 10]"], "layer_heights_km: must be 0 with sequences and loops: only single"),
         ("design", ["layer_heights_km=[0, 10]"], "layer_heights_km: must be 0 with nlcwfs design, got [0.0, 10.0]"),
     ],
 )
@@ -98,3 +97,10 @@ def test_bad_heights_are_one_line(tmp_path, command, change, message):
     done = type_in(command, *words, *out)
     assert done.exit_code == 2
     assert done.stderr.strip().splitlines()[-1].startswith(f"nlcwfs: atmosphere.{message}")
+
+
+def test_a_loop_in_many_colours_refuses_heights_in_a_line(tmp_path):
+    done = type_in("loop", *settings(*SMALL, *HIGH, *BAND), "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    line = "nlcwfs: atmosphere.layer_heights_km: must be 0 with light of many colours in sequences and loops, got "
+    assert done.stderr.strip().splitlines()[-1].startswith(line)
